@@ -1,0 +1,40 @@
+"""Reinforcement learning when observations arrive late.
+
+`make` wraps a Gymnasium task with a delay, `train` trains an agent on it, `load` gives back the policy of a
+run. JAX is imported only when training or a policy is asked for: `delayrl.wrappers` needs NumPy and Gymnasium alone.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from delayrl.agents import AGENTS as AGENTS
+    from delayrl.delays import Constant as Constant
+    from delayrl.envs import make as make
+    from delayrl.errors import DelayRLError as DelayRLError
+    from delayrl.policy import Policy as Policy
+    from delayrl.policy import load as load
+    from delayrl.training import train as train
+    from delayrl.wrappers import AugmentedObservation as AugmentedObservation
+    from delayrl.wrappers import DelayedObservation as DelayedObservation
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "AGENTS": "agents",
+    "AugmentedObservation": "wrappers",
+    "Constant": "delays",
+    "DelayRLError": "errors",
+    "DelayedObservation": "wrappers",
+    "Policy": "policy",
+    "load": "policy",
+    "make": "envs",
+    "train": "training",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(f"delayrl.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'delayrl' has no attribute {name!r}")

@@ -1,0 +1,5 @@
+"""`python -m delayrl` is the command line."""
+
+from delayrl.cli import main
+
+main()

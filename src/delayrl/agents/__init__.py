@@ -1,0 +1,53 @@
+"""The registry: every agent with its presets. To add one: its file, its line here, its page in docs/algorithms."""
+
+from dataclasses import replace
+
+from delayrl.agents.base import Entry, Preset, Schedule
+from delayrl.agents.random import Random
+from delayrl.agents.sac import SAC
+from delayrl.agents.vdpo import VDPO
+
+_PAPER = Schedule()
+_SMALL = Schedule(
+    steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500, evaluation_episodes=10
+)
+
+
+def _soft(summary: str, paper: str, **sees: str) -> Entry:
+    """SAC on two views: it differs in what is seen alone, so that nothing else explains a difference."""
+    agent = SAC(**sees)  # type: ignore[arg-type]
+    presets = {"paper": Preset(agent, _PAPER), "small": Preset(replace(agent, batch_size=128), _SMALL)}
+    return Entry(summary, paper, presets)
+
+
+_small_vdpo = VDPO(
+    SAC(batch_size=128), width=64, layers=2, dropout=0.0, clone_every=250, clone_updates=250
+)
+
+AGENTS: dict[str, Entry] = {
+    "vdpo": Entry(
+        "clones a delay-free SAC into a transformer on (last observation, actions since)",
+        "Wu et al., NeurIPS 2024",
+        {"paper": Preset(VDPO(), _PAPER), "small": Preset(_small_vdpo, _SMALL)},
+    ),
+    "bpql": _soft(
+        "SAC whose actor sees x_t and whose critic sees s_t",
+        "Kim et al., NeurIPS 2023",
+        actor_sees="augmented",
+        critic_sees="current",
+    ),
+    "a-sac": _soft(
+        "SAC on the augmented state x_t = (last observation, actions since)",
+        "Haarnoja et al., ICML 2018; Altman & Nain 1992",
+        actor_sees="augmented",
+        critic_sees="augmented",
+    ),
+    "sac-memoryless": _soft(
+        "SAC that takes the last observation for the current one",
+        "Haarnoja et al., ICML 2018",
+        actor_sees="delayed",
+        critic_sees="delayed",
+    ),
+    "sac": _soft("the delay-free reference: trains with --delay 0", "Haarnoja et al., ICML 2018"),
+    "random": Entry("uniform actions", "-", {name: Preset(Random(), s) for name, s in (("paper", _PAPER), ("small", _SMALL))}),
+}

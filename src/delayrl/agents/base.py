@@ -1,0 +1,101 @@
+"""What an agent is, and what the loop must know of it. Documentation: there is no behaviour here to inherit."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, Protocol
+
+import jax
+import optax
+from jaxtyping import Array, Int
+
+from delayrl.networks import Params
+from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
+
+State = Any
+"""An agent's state: a tree of arrays; networks, optimisers, temperatures."""
+
+
+class Phase(NamedTuple):
+    """`updates` gradient updates every `every` environment steps, each on a fresh batch of `batch` windows.
+
+    `update(state, windows, key, count)` is pure; `count` numbers the phase's updates from 0 on.
+    """
+
+    every: int
+    updates: int
+    batch: int
+    update: Callable[[State, Window, Key, Int[Array, ""]], tuple[State, Metrics]]
+
+
+class Agent(Protocol):
+    """A frozen dataclass of hyperparameters with pure methods, written for one seed."""
+
+    @property
+    def privileged(self) -> bool:
+        """Whether its behaviour reads the true current state while it trains."""
+        ...
+
+    def ahead(self, spec: Spec) -> int:
+        """How many steps after t its windows reach."""
+        ...
+
+    def phases(self) -> tuple[Phase, ...]:
+        """What it learns, and when."""
+        ...
+
+    def init(self, spec: Spec, key: Key) -> State:
+        """A fresh state. Raises DelayRLError where the agent does not suit the task."""
+        ...
+
+    def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
+        """An action in [-1, 1]; without `explore` deterministic, and `seen.truth` is None."""
+        ...
+
+    def reference(self, state: State) -> "tuple[Agent, State] | None":
+        """The delay-free policy inside it, where there is one: evaluated beside it, without delay."""
+        ...
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long a run is, and what happens when."""
+
+    steps: Annotated[int, "environment steps to train"] = 1_000_000
+    random_steps: Annotated[int, "uniformly random actions, and no updates, for so many steps first"] = 5_000
+    replay_capacity: Annotated[int, "rows of the replay: one a step, and one more an episode"] = 1_000_000
+    evaluate_every: Annotated[int, "steps between two evaluations (and checkpoints)"] = 10_000
+    evaluation_episodes: Annotated[int, "episodes of each evaluation"] = 10
+
+
+class Preset(NamedTuple):
+    """Hyperparameters and schedule that belong together."""
+
+    agent: Agent
+    schedule: Schedule
+
+
+class Entry(NamedTuple):
+    """One line of the registry."""
+
+    summary: str
+    paper: str
+    presets: dict[str, Preset]
+
+
+def template(agent: Agent, spec: Spec) -> State:
+    """Shapes and types of the agent's state, without computing it. Raises what `init` raises."""
+    return jax.eval_shape(functools.partial(agent.init, spec), jax.random.key(0))
+
+
+def descend(
+    optimiser: optax.GradientTransformation, loss: Callable[..., Any], params: Params, memory: optax.OptState, *args: Any
+) -> tuple[Params, optax.OptState, Any, Any]:
+    """One step of gradient descent on `loss(params, *args) -> (value, extra)`.
+
+    Returns:
+        The new parameters, the optimiser's new memory, the loss and the extra.
+    """
+    (value, extra), gradient = jax.value_and_grad(loss, has_aux=True)(params, *args)
+    change, memory = optimiser.update(gradient, memory, params)
+    return optax.apply_updates(params, change), memory, value, extra

@@ -1,0 +1,195 @@
+"""Soft actor-critic on two views: SAC, memoryless SAC, A-SAC and BPQL are this one update.
+
+Papers: SAC (Haarnoja et al. 2018); A-SAC and BPQL (Kim et al. 2023) as VDPO's tables name them.
+Idea: a soft Q-learner with an entropy-regularised actor. What the actor sees decides what it can do under delay; what
+the critic sees decides how large the space is in which values are learned.
+
+| agent | actor sees | critic sees |
+| --- | --- | --- |
+| sac (the delay-free reference) | s_t | s_t |
+| sac-memoryless | s_{t-Δ} | s_{t-Δ} |
+| a-sac | x_t | x_t |
+| bpql | x_t | s_t |
+
+Deviations are numbered in docs/algorithms/sac.md.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from delayrl import networks
+from delayrl.agents.base import Agent, Phase, descend
+from delayrl.errors import DelayRLError
+from delayrl.networks import Gaussian, LogStdBounds, Params
+from delayrl.objectives import k_step_return, soft_target, soft_value, temperature_loss
+from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.views import Sees, input_size, look, network_input
+
+
+class State(NamedTuple):
+    """Networks, their targets, and what their optimisers remember."""
+
+    actor: Params
+    critic: Params
+    target: Params
+    log_temperature: Float[Array, ""]
+    actor_memory: optax.OptState
+    critic_memory: optax.OptState
+    temperature_memory: optax.OptState
+
+
+@dataclass(frozen=True)
+class SAC:
+    """Hyperparameters of soft actor-critic; the defaults are VDPO's (appendix, table of hyperparameters)."""
+
+    actor_sees: Annotated[Sees, "fixed"] = "current"
+    critic_sees: Annotated[Sees, "fixed"] = "current"
+    hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
+    actor_learning_rate: Annotated[float, "Adam's step size for the actor"] = 3e-4
+    critic_learning_rate: Annotated[float, "Adam's step size for the critics"] = 1e-3
+    temperature_learning_rate: Annotated[float, "Adam's step size for the temperature"] = 1e-3
+    initial_temperature: Annotated[float, "weight of the entropy at the start"] = 1.0
+    entropy_per_action: Annotated[float, "target entropy, for each dimension of the action"] = -1.0
+    discount: Annotated[float, "γ"] = 0.99
+    target_rate: Annotated[float, "τ: how far the target critics move each update"] = 5e-3
+    n_steps: Annotated[int, "longest k of the k-step targets; k is drawn from 1..n_steps"] = 3
+    actor_every: Annotated[int, "critic updates between two rounds of actor updates"] = 2
+    actor_updates: Annotated[int, "actor updates in a round"] = 2
+    log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-5.0, 2.0)
+    log_std_bounds: Annotated[LogStdBounds, "how it is kept there"] = "rescale"
+    batch_size: Annotated[int, "windows in a batch"] = 256
+    update_every: Annotated[int, "environment steps between two rounds of updates"] = 1
+    updates: Annotated[int, "updates in a round"] = 1
+
+    privileged = False
+
+    def ahead(self, spec: Spec) -> int:
+        """k-step targets reach so far."""
+        return self.n_steps
+
+    def phases(self) -> tuple[Phase, ...]:
+        """One: the update."""
+        return (Phase(self.update_every, self.updates, self.batch_size, self.update),)
+
+    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
+        """There is none inside."""
+        return None
+
+    def init(self, spec: Spec, key: Key) -> State:
+        """Fresh networks; targets are copies."""
+        if self.actor_sees == "current" and spec.delay > 0:
+            raise DelayRLError(
+                f"sac is the delay-free reference: train it with --delay 0, got {spec.delay}; "
+                "sac-memoryless, a-sac and bpql take a delay"
+            )
+        actor_key, critic_key = jax.random.split(key)
+        sizes = (input_size(spec, self.actor_sees), *self.hidden, 2 * spec.action_size)
+        actor = networks.mlp_init(actor_key, sizes)
+        critic = networks.twin_init(
+            critic_key, (input_size(spec, self.critic_sees) + spec.action_size, *self.hidden, 1)
+        )
+        log_temperature = jnp.log(jnp.asarray(self.initial_temperature, jnp.float32))
+        return State(
+            actor,
+            critic,
+            jax.tree.map(jnp.copy, critic),
+            log_temperature,
+            optax.adam(self.actor_learning_rate).init(actor),
+            optax.adam(self.critic_learning_rate).init(critic),
+            optax.adam(self.temperature_learning_rate).init(log_temperature),
+        )
+
+    def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
+        """The actor's Gaussian at inputs `x`."""
+        return networks.gaussian(actor, x, self.log_std_range, self.log_std_bounds)
+
+    def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
+        """A sample of the policy, or its mode."""
+        policy = self.policy(state.actor, network_input(seen, self.actor_sees))
+        return networks.sample(policy, key)[0] if explore else networks.mode(policy)
+
+    def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
+        """One critic update; every `actor_every`-th time the actor and the temperature, on the same batch."""
+        target_key, actor_key = jax.random.split(key)
+        actor_now, critic_now = self._inputs(windows, 0)
+        actor_next, critic_next = self._inputs(windows, windows.steps)
+        now, last = windows.delay, windows.delay + windows.steps - 1
+
+        temperature = jnp.exp(state.log_temperature)
+        action, log_prob = networks.sample(self.policy(state.actor, actor_next), target_key)
+        y = soft_target(
+            k_step_return(windows.reward[:, now:], self.discount, windows.steps),
+            self.discount**windows.steps,
+            jnp.take_along_axis(windows.terminated, last[:, None], 1)[:, 0],
+            soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature),
+        )
+        critic, critic_memory, loss, q = descend(
+            optax.adam(self.critic_learning_rate),
+            critic_loss,
+            state.critic,
+            state.critic_memory,
+            critic_now,
+            windows.action[:, now],
+            y,
+        )
+        state = state._replace(critic=critic, critic_memory=critic_memory)
+        state = jax.lax.cond(
+            count % self.actor_every == self.actor_every - 1,
+            lambda state: self._improve(state, actor_now, critic_now, actor_key),
+            lambda state: state,
+            state,
+        )
+        target = optax.incremental_update(state.critic, state.target, self.target_rate)
+        metrics = {"critic_loss": loss, "q": q, "entropy": -log_prob.mean(), "temperature": temperature}
+        return state._replace(target=target), metrics
+
+    def _improve(self, state: State, actor_input: Array, critic_input: Array, key: Key) -> State:
+        """Rounds of policy improvement and of temperature adjustment."""
+        target_entropy = self.entropy_per_action * state.actor[-1]["b"].shape[-1] / 2
+
+        def actor_loss(actor: Params, temperature: Array, key: Key) -> tuple[Array, Array]:
+            action, log_prob = networks.sample(self.policy(actor, actor_input), key)
+            value = soft_value(networks.twin(state.critic, critic_input, action), log_prob, temperature)
+            return -value.mean(), log_prob
+
+        for update_key in jax.random.split(key, self.actor_updates):
+            draw, redraw = jax.random.split(update_key)
+            temperature = jnp.exp(state.log_temperature)
+            actor, actor_memory, _, _ = descend(
+                optax.adam(self.actor_learning_rate), actor_loss, state.actor, state.actor_memory, temperature, draw
+            )
+            _, log_prob = networks.sample(self.policy(actor, actor_input), redraw)
+            log_temperature, temperature_memory, _, _ = descend(
+                optax.adam(self.temperature_learning_rate),
+                lambda log_temperature, log_prob: (
+                    temperature_loss(log_temperature, log_prob, target_entropy),
+                    None,
+                ),
+                state.log_temperature,
+                state.temperature_memory,
+                log_prob,
+            )
+            state = state._replace(
+                actor=actor,
+                actor_memory=actor_memory,
+                log_temperature=log_temperature,
+                temperature_memory=temperature_memory,
+            )
+        return state
+
+    def _inputs(self, windows: Window, ahead: int | Array) -> tuple[Array, Array]:
+        """What actor and critic see `ahead` steps after t, for each window."""
+        ahead = jnp.broadcast_to(ahead, windows.steps.shape)
+        pair = jax.vmap(lambda window, k: (look(window, self.actor_sees, k), look(window, self.critic_sees, k)))
+        return pair(windows, ahead)
+
+
+def critic_loss(critic: Params, x: Array, action: Array, target: Array) -> tuple[Array, Array]:
+    """Squared error of both critics, added (VDPO eq. max_pe); and their mean value."""
+    q = networks.twin(critic, x, action)
+    return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum(), q.mean()

@@ -1,0 +1,210 @@
+"""Variational Delayed Policy Optimization (Wu et al., NeurIPS 2024), Algorithm 1.
+
+Idea: (A) learn a reference policy with SAC where there is no delay; (B) clone it into a delayed policy: a transformer on
+(last observation, actions since) whose belief head reconstructs the unseen states, and whose policy head is brought
+near the reference by KL. Position i of the transformer serves the delay i + 1, so one network serves every age 1..Δ;
+at age 0 the state is current and the reference itself acts.
+
+Views: the reference sees s_t, the delayed policy x_t. While it trains, its behaviour reads s_t (privileged), unless
+`behaviour="delayed"`.
+
+Deviations from the paper and from the released code are numbered in docs/algorithms/vdpo.md.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from delayrl import networks
+from delayrl.agents import sac
+from delayrl.agents.base import Agent, Phase, descend
+from delayrl.errors import DelayRLError
+from delayrl.networks import Gaussian, Params
+from delayrl.objectives import gaussian_kl, masked_mean
+from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.views import view
+
+Representation = Literal["transformer", "transformer-no-belief", "mlp"]
+Behaviour = Literal["lower-q", "delayed", "reference", "mixture"]
+Direction = Literal["reverse", "forward"]
+
+
+class State(NamedTuple):
+    """The reference, and the delayed policy's parts: encoder, belief decoder, policy head."""
+
+    reference: sac.State
+    encoder: Params
+    decoder: Params
+    head: Params
+    belief_memory: optax.OptState
+    clone_memory: optax.OptState
+
+
+class Unseen(NamedTuple):
+    """What is cloned from: x_{t+1}, and the states that it hides."""
+
+    obs: Float[Array, "batch obs"]
+    actions: Float[Array, "batch delay action"]
+    states: Float[Array, "batch delay obs"]
+    mask: Bool[Array, "batch delay"]
+
+
+@dataclass(frozen=True)
+class VDPO:
+    """Hyperparameters; the defaults are the paper's (appendix) and, where it is silent, the released code's."""
+
+    reference: sac.SAC = sac.SAC()
+    representation: Annotated[Representation, "of x_t; the paper's ablation"] = "transformer"
+    width: Annotated[int, "embedding dimension of the transformer, and width of the policy head"] = 256
+    layers: Annotated[int, "blocks of the transformer"] = 3
+    dropout: Annotated[float, "rate in embedding, attention and residuals"] = 0.1
+    learning_rate: Annotated[float, "Adam's step size for the delayed policy"] = 3e-4
+    clone_every: Annotated[int, "environment steps between two rounds of cloning"] = 1000
+    clone_updates: Annotated[int, "KL updates in a round, each on a fresh batch"] = 1000
+    direction: Annotated[Direction, "KL(delayed‖reference), or forward: KL(reference‖delayed)"] = "reverse"
+    behaviour: Annotated[
+        Behaviour, "who acts in training: of both policies' samples the one with the lower Q, one of them, or a coin flip"
+    ] = "lower-q"
+
+    @property
+    def privileged(self) -> bool:
+        """The reference needs the true state to act."""
+        return self.behaviour != "delayed"
+
+    def ahead(self, spec: Spec) -> int:
+        """The reference's targets; cloning needs one step."""
+        return self.reference.ahead(spec)
+
+    def phases(self) -> tuple[Phase, ...]:
+        """Reference and belief at every step; now and then many KL updates."""
+        batch = self.reference.batch_size
+        return Phase(1, 1, batch, self.update), Phase(self.clone_every, self.clone_updates, batch, self.clone)
+
+    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
+        """The delay-free SAC that is cloned."""
+        return self.reference, state.reference
+
+    def init(self, spec: Spec, key: Key) -> State:
+        """Fresh networks; Δ is the transformer's length."""
+        if spec.delay < 1:
+            raise DelayRLError("vdpo learns a policy for a delay of at least 1 step: give --delay N, or train sac")
+        reference_key, encoder_key, decoder_key, head_key = jax.random.split(key, 4)
+        encoder: Params = {}
+        features = spec.obs_size + spec.delay * spec.action_size + 1
+        if self.representation != "mlp":
+            sizes = (spec.obs_size, spec.action_size, spec.delay, self.width, self.layers)
+            encoder, features = networks.transformer_init(encoder_key, *sizes), self.width
+        decoder = networks.linear_init(decoder_key, features, spec.obs_size, 0.02)
+        head = networks.mlp_init(head_key, (features, self.width, self.width, 2 * spec.action_size), 0.02)
+        adam = optax.adam(self.learning_rate)
+        return State(
+            self.reference.init(replace(spec, delay=0), reference_key),
+            encoder,
+            decoder,
+            head,
+            adam.init((encoder, decoder)),
+            adam.init(self._cloned(encoder, head)),
+        )
+
+    def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
+        """The delayed policy at the shown age; in training, who acts is what `behaviour` says."""
+        dropout_key, delayed_key, reference_key, coin_key = jax.random.split(key, 4)
+        every_age = self.policy(state, seen.obs, seen.actions, dropout_key if explore else None)
+        current = self.reference.policy(state.reference.actor, seen.obs)
+        policy = Gaussian(*(jnp.where(seen.age > 0, d[seen.age - 1], c) for d, c in zip(every_age, current, strict=True)))
+        if not explore:
+            return networks.mode(policy)
+        delayed, _ = networks.sample(policy, delayed_key)
+        if self.behaviour == "delayed":
+            return delayed
+        truth = seen.truth
+        reference, _ = networks.sample(self.reference.policy(state.reference.actor, truth), reference_key)
+        if self.behaviour == "reference":
+            return reference
+        if self.behaviour == "mixture":
+            return jnp.where(jax.random.bernoulli(coin_key), reference, delayed)
+        q_reference, q_delayed = (
+            networks.twin(state.reference.critic, truth, action).min(0) for action in (reference, delayed)
+        )
+        return jnp.where(q_reference < q_delayed, reference, delayed)
+
+    def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
+        """(A) SAC's update of the reference; and of encoder and belief decoder (eq. min_rec), on the same batch."""
+        sac_key, dropout_key = jax.random.split(key)
+        reference, metrics = self.reference.update(state.reference, windows, sac_key, count)
+        state = state._replace(reference=reference)
+        if self.representation != "transformer":
+            return state, metrics
+        (encoder, decoder), memory, loss, _ = descend(
+            optax.adam(self.learning_rate),
+            self.belief_loss,
+            (state.encoder, state.decoder),
+            state.belief_memory,
+            unseen(windows),
+            dropout_key,
+        )
+        return state._replace(encoder=encoder, decoder=decoder, belief_memory=memory), metrics | {"belief_loss": loss}
+
+    def clone(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
+        """(B) One KL update of the policy head towards the reference (eq. min_kl); the encoder stays where it is."""
+        cloned, memory, loss, _ = descend(
+            optax.adam(self.learning_rate),
+            self.clone_loss,
+            self._cloned(state.encoder, state.head),
+            state.clone_memory,
+            state,
+            unseen(windows),
+            key,
+        )
+        return self._with_cloned(state, cloned)._replace(clone_memory=memory), {"kl": loss}
+
+    def policy(self, state: State, obs: Array, actions: Array, key: Key | None = None) -> Gaussian:
+        """The delayed policy for every age 1..Δ: [..., Δ, A]."""
+        return self.reference.policy(state.head, self.encode(state.encoder, obs, actions, key))
+
+    def encode(self, encoder: Params, obs: Array, actions: Array, key: Key | None) -> Float[Array, "*batch delay width"]:
+        """What the heads read at each age. `mlp`: the augmented state of that age itself."""
+        if self.representation != "mlp":
+            return networks.transformer(encoder, obs, actions, self.dropout, key)
+        *batch, delay, size = actions.shape
+        until = jnp.where(jnp.tril(jnp.ones((delay, delay), bool))[..., None], actions[..., None, :, :], 0)
+        ages = jnp.broadcast_to(jnp.arange(1, delay + 1)[:, None] / delay, (*batch, delay, 1))
+        repeated = jnp.broadcast_to(obs[..., None, :], (*batch, delay, obs.shape[-1]))
+        return jnp.concatenate([repeated, until.reshape(*batch, delay, delay * size), ages], -1)
+
+    def belief_loss(self, params: tuple[Params, Params], x: Unseen, key: Key) -> tuple[Array, None]:
+        """Mean squared error of the reconstructed states (eq. min_rec)."""
+        encoder, decoder = params
+        states = networks.linear(decoder, self.encode(encoder, x.obs, x.actions, key))
+        return masked_mean(((states - x.states) ** 2).mean(-1), x.mask), None
+
+    def clone_loss(self, cloned: Params, state: State, x: Unseen, key: Key) -> tuple[Array, None]:
+        """KL between the delayed policy at each age and the reference at the state that it cannot see (eq. min_kl)."""
+        delayed = self.policy(self._with_cloned(state, cloned), x.obs, x.actions, key)
+        reference = self.reference.policy(state.reference.actor, x.states)
+        pair = (delayed, reference) if self.direction == "reverse" else (reference, delayed)
+        return masked_mean(gaussian_kl(*pair).mean(-1), x.mask), None
+
+    def _cloned(self, encoder: Params, head: Params) -> Params:
+        """What cloning trains: the head; without a belief loss the encoder too."""
+        return {"head": head, "encoder": encoder} if self.representation == "transformer-no-belief" else {"head": head}
+
+    def _with_cloned(self, state: State, cloned: Params) -> State:
+        return state._replace(**cloned)
+
+
+def unseen(windows: Window) -> Unseen:
+    """x_{t+1} with all the Δ steps that it hides (fewer at the start of an episode), for each window."""
+
+    def one(window: Window) -> Unseen:
+        now = window.delay + 1
+        age = window.valid[1:now].sum()
+        x = view(window, 1, age=age)
+        slots = jnp.arange(window.delay)
+        return Unseen(x.obs, x.actions, window.obs[jnp.minimum(now - age + 1 + slots, now)], slots < age)
+
+    return jax.vmap(one)(windows)

@@ -1,0 +1,78 @@
+"""Configuration: frozen dataclasses are flattened to named options, overridden by name, and rebuilt from JSON."""
+
+import difflib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from delayrl.errors import DelayRLError
+
+
+@dataclass(frozen=True)
+class Option:
+    """One hyperparameter: its name, type (a Python type, or the allowed words), default and meaning."""
+
+    name: str
+    kind: Any
+    default: Any
+    help: str
+
+    def check(self, value: Any) -> Any:
+        """The value, in this option's type; DelayRLError where it does not fit."""
+        if get_origin(self.kind) is Literal:
+            if value not in get_args(self.kind):
+                raise DelayRLError(f"{self.name} must be one of {', '.join(get_args(self.kind))}; got {value!r}")
+            return value
+        if get_origin(self.kind) is tuple:
+            inner = get_args(self.kind)
+            count = len(inner) if inner[-1] is not Ellipsis else None
+            if not isinstance(value, tuple | list) or not value or (count and len(value) != count):
+                raise DelayRLError(f"{self.name} takes {count or 'one or more'} numbers; got {value!r}")
+            return tuple(Option(self.name, inner[0], None, "").check(item) for item in value)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise DelayRLError(f"{self.name} must be a number; got {value!r}")
+        if self.kind is float:
+            return float(value)
+        if value != int(value) or value < (0 if self.name == "random_steps" else 1):
+            raise DelayRLError(f"{self.name} must be a whole number above 0; got {value!r}")
+        return int(value)
+
+
+def options(config: Any) -> Iterator[Option]:
+    """Every option of a dataclass, those of dataclasses inside it included; what is marked `fixed` is no option."""
+    hints = get_type_hints(type(config), include_extras=True)
+    for field in fields(config):
+        value, hint = getattr(config, field.name), hints[field.name]
+        if is_dataclass(value):
+            yield from options(value)
+        elif get_origin(hint) is Annotated and get_args(hint)[1] != "fixed":
+            yield Option(field.name, get_args(hint)[0], value, get_args(hint)[1])
+
+
+def override(config: Any, values: Mapping[str, Any]) -> Any:
+    """The dataclass with some of its options replaced; names that it does not have are left alone."""
+    changes: dict[str, Any] = {}
+    known = {option.name: option for option in options(config)}
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            changes[field.name] = override(value, values)
+        elif field.name in values and field.name in known:
+            changes[field.name] = known[field.name].check(values[field.name])
+    return replace(config, **changes)
+
+
+def check_names(values: Mapping[str, Any], *configs: Any) -> None:
+    """DelayRLError, with the nearest names, for a value that is an option of none of the dataclasses."""
+    known = [option.name for config in configs for option in options(config)]
+    for name in values:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+            hint = f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(known)}"
+            raise DelayRLError(f"unknown hyperparameter {name!r}; {hint}")
+
+
+def values_of(config: Any) -> dict[str, Any]:
+    """All options by name: what `override` would need to rebuild it."""
+    return {option.name: list(o) if isinstance(o := option.default, tuple) else o for option in options(config)}

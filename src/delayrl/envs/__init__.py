@@ -1,0 +1,79 @@
+"""Tasks: any id of Gymnasium's registry, and our own under `delayrl/`; wrapped with a delay."""
+
+import contextlib
+import difflib
+import io
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import RescaleAction
+
+from delayrl.delays import DelayLaw
+from delayrl.envs import probe
+from delayrl.errors import DelayRLError
+from delayrl.wrappers import DelayedObservation, check_spaces
+
+probe.register()
+
+PAPER_TASKS = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Pusher", "Reacher", "Swimmer", "Walker2d")
+
+
+def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **options: Any) -> DelayedObservation:
+    """A Gymnasium task whose observations arrive late.
+
+    Args:
+        env: an id of Gymnasium's registry, e.g. "InvertedPendulum-v5".
+        delay: environment steps, or a delay law; must be shorter than an episode.
+        rescale: take (and show in `info`) actions in [-1, 1] instead of the task's own range.
+        **options: go to `gymnasium.make`, e.g. `render_mode="rgb_array"`.
+
+    Raises:
+        DelayRLError: unknown task (with the nearest names), unsuitable spaces, bad delay.
+    """
+    try:
+        # MuJoCo and Gymnasium print notes on deprecated versions that are no business of the user's
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            task = gym.make(env, disable_env_checker=True, **options)
+    except (gym.error.Error, ModuleNotFoundError, ImportError) as error:
+        near = difflib.get_close_matches(env, gym.registry, n=3, cutoff=0.5)
+        hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists the tasks we know"
+        reason = "unknown task" if env not in gym.registry else f"task cannot be made ({_first_line(error)}):"
+        raise DelayRLError(f"{reason} {env!r}; {hint}") from error
+    check_spaces(task)
+    if rescale:
+        task = RescaleAction(task, np.float32(-1), np.float32(1))
+    return DelayedObservation(task, delay)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What `delayrl tasks` shows of a task: sizes, action range, time limit in steps and step length in seconds."""
+
+    name: str
+    obs_size: int
+    action_size: int
+    action_high: float
+    time_limit: int | None
+    seconds: float | None
+
+
+def tasks() -> Iterator[Task]:
+    """The paper's nine tasks, the small ones to try things on, and the probes of the tests."""
+    small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
+    ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
+    for name in [f"{task}-v5" for task in PAPER_TASKS] + small + ours:
+        env = make(name)
+        spaces = (env.observation_space.shape, env.action_space.shape)
+        limit = env.spec.max_episode_steps if env.spec else None
+        high = float(np.max(env.action_space.high))  # type: ignore[attr-defined]
+        yield Task(name, spaces[0][0], spaces[1][0], high, limit, getattr(env.unwrapped, "dt", None))  # type: ignore[index]
+        env.close()
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

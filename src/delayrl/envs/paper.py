@@ -1,0 +1,189 @@
+"""The nine MuJoCo tasks of the delayed-RL papers, with the physics that they were published on.
+
+The papers use Gymnasium's `-v4` tasks on MuJoCo 2. On MuJoCo 3 the same ids are other tasks, because the
+library changed underneath. Here Gymnasium's own environments are built, and `MuJoCo2` undoes those changes.
+How far the result agrees with MuJoCo 2.3.7 is in `docs/tasks.md`.
+
+    delayrl.envs.paper.register()
+    env = gymnasium.make("delayrl/Ant-v4")
+"""
+
+import hashlib
+import re
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+
+from delayrl.errors import DelayRLError
+
+TASKS = (
+    "Ant",
+    "HalfCheetah",
+    "Hopper",
+    "Humanoid",
+    "HumanoidStandup",
+    "Pusher",
+    "Reacher",
+    "Swimmer",
+    "Walker2d",
+)
+OLDEST, MARGINS_SUMMED, TOO_NEW = (3, 2, 7), (3, 5, 0), (4, 0, 0)  # MuJoCo versions
+
+# What a fingerprint reads of the model. Positions and orientations are left out: they act through the steps,
+# and the axes of a round body's inertia are arbitrary.
+OPTIONS = """
+timestep gravity density viscosity integrator solver iterations tolerance cone impratio disableflags
+enableflags
+"""
+CONSTANTS = """
+body_mass body_inertia body_invweight0 dof_invweight0 dof_armature dof_damping jnt_type jnt_stiffness
+jnt_range jnt_margin jnt_solref jnt_solimp geom_type geom_size geom_contype geom_conaffinity geom_condim
+geom_margin geom_gap geom_friction geom_solref geom_solimp actuator_gear actuator_ctrlrange
+"""
+
+
+def register() -> None:
+    """Add `delayrl/Ant-v4` … `delayrl/Walker2d-v4` to Gymnasium's registry. Harmless again; loads no MuJoCo.
+
+    Entry point, time limit and reward threshold are Gymnasium's own. Its `Pusher-v4` refuses MuJoCo 3, so
+    here Pusher is `Pusher-v5` with v4's model file and v4's reward timing.
+    """
+    for task in TASKS:
+        task_id = f"delayrl/{task}-v4"
+        if task_id in gymnasium.registry:
+            continue
+        pusher = task == "Pusher"
+        origin = gymnasium.registry["Pusher-v5" if pusher else f"{task}-v4"]
+        gymnasium.register(
+            id=task_id,
+            entry_point=origin.entry_point,
+            max_episode_steps=origin.max_episode_steps,
+            reward_threshold=origin.reward_threshold,
+            kwargs={"xml_file": "pusher.xml"} if pusher else {},
+            additional_wrappers=(
+                (MuJoCo2.wrapper_spec(), RewardBeforeStep.wrapper_spec())
+                if pusher
+                else (MuJoCo2.wrapper_spec(),)
+            ),
+        )
+
+
+class MuJoCo2(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Gives a Gymnasium MuJoCo environment the physics and the reset observation of MuJoCo 2.3.7.
+
+    Undone are, with the MuJoCo version that brought them:
+
+    - 3.0: the inverse weight of a body that only slides leaves out its joints' armature (Pusher);
+    - 3.2: `reset` shows the orientation as it was drawn, not as a unit quaternion (Ant, both Humanoids);
+    - 3.3: another algorithm finds the contacts of cylinders (Pusher);
+    - 3.5: a contact's margin is the sum of its geoms' margins, not the larger (Ant, Hopper, both Humanoids,
+      Pusher).
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]):
+        RecordConstructorArgs.__init__(self)
+        gymnasium.Wrapper.__init__(self, env)
+        restore_physics(self.unwrapped)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset, and show a free joint's orientation as a unit quaternion, as MuJoCo did before 3.2."""
+        base: Any = self.unwrapped
+        restore_physics(base)  # an environment that was pickled comes back with a newly loaded model
+        observation, info = self.env.reset(seed=seed, options=options)
+        free_joints = base.model.jnt_qposadr[base.model.jnt_type == 0]
+        for address in free_joints:
+            quaternion = base.data.qpos[address + 3 : address + 7]
+            quaternion /= np.linalg.norm(quaternion)
+        return (base._get_obs() if len(free_joints) else observation), info
+
+
+class RewardBeforeStep(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Pays for the state that the action was taken in, as Pusher-v4 does; v5 pays for the next state."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]):
+        RecordConstructorArgs.__init__(self)
+        gymnasium.Wrapper.__init__(self, env)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step; the reward and its terms in `info` are those of before the step."""
+        base: Any = self.unwrapped
+        reward, terms = base._get_rew(action)
+        observation, _, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info | terms
+
+
+def restore_physics(base: Any) -> None:
+    """Undo, in the compiled model of a Gymnasium `MujocoEnv`, what MuJoCo 3 means otherwise; once per model.
+
+    Args:
+        base: the unwrapped environment; its `model` is changed in place.
+
+    Raises:
+        DelayRLError: the installed MuJoCo is outside the range for which the changes are known.
+    """
+    if getattr(base, "restored_model", None) is base.model:
+        return
+    import mujoco
+
+    version, model = _supported_version(mujoco.__version__), base.model
+    for flag in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # where they can be disabled, they are on
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, flag, 0))
+    if version >= MARGINS_SUMMED:
+        # In each task all geoms that can touch have one margin, so that halves sum to what was the larger.
+        model.geom_margin[:] *= 0.5
+    for body in np.flatnonzero(model.body_simple == 2):  # 2: all its joints are slides
+        # MuJoCo 3 takes 1 / mass. Pusher's object has hardly any: its contacts went limp and the arm passes
+        # through it (https://github.com/Farama-Foundation/Gymnasium/issues/950).
+        dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
+        model.dof_invweight0[dofs] = 1.0 / (model.dof_armature[dofs] + model.body_mass[body])
+        model.body_invweight0[body] = model.dof_invweight0[dofs].sum() / 3.0, 0.0  # translation, rotation
+    base.restored_model = model
+
+
+def fingerprint(env: gymnasium.Env[Any, Any]) -> str:
+    """A short name for the physics of an environment: 16 hexadecimal digits.
+
+    It is made of the sizes, the model's constants (to 6 digits), and where 20 steps with fixed pseudo-random
+    controls lead from the model's initial state (to 1e-5). Rewards, terminations and wrappers do not enter.
+    One physics may read differently in two MuJoCo versions, so compare within one version. `env` is left as
+    it is: the steps run on a simulation of their own.
+
+    Raises:
+        DelayRLError: `env` is not a Gymnasium MuJoCo environment.
+    """
+    base: Any = env.unwrapped
+    if not hasattr(base, "model") or not hasattr(base, "frame_skip"):
+        raise DelayRLError(f"fingerprint: give it a Gymnasium MuJoCo environment, not {type(base).__name__}")
+    import mujoco
+
+    model = base.model
+    sizes = base.observation_space.shape, base.action_space.shape, (base.frame_skip, model.nq, model.nv)
+    digest = hashlib.sha256(repr(sizes).encode())
+    for source, names in ((model.opt, OPTIONS), (model, CONSTANTS)):
+        for name in names.split():
+            numbers = np.ravel(np.asarray(getattr(source, name), dtype=np.float64)).tolist()
+            digest.update(" ".join([name, *(f"{number:.6g}" for number in numbers)]).encode())
+
+    data = mujoco.MjData(model)
+    low, high = model.actuator_ctrlrange.T
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        data.ctrl[:] = rng.uniform(low, high)
+        mujoco.mj_step(model, data, nstep=base.frame_skip)
+    state = np.round(np.concatenate([data.qpos, data.qvel]), 5) + 0.0  # + 0.0 makes -0.0 and 0.0 one
+    digest.update(repr(state.tolist()).encode())
+    return digest.hexdigest()[:16]
+
+
+def _supported_version(installed: str) -> tuple[int, ...]:
+    version = tuple(int(part) for part in re.findall(r"\d+", installed)[:3])
+    if not OLDEST <= version < TOO_NEW:
+        raise DelayRLError(
+            f"the paper tasks need MuJoCo 3.2.7 or later, before 4, and {installed} is installed: "
+            "pip install 'mujoco>=3.2.7,<4'"
+        )
+    return version

@@ -1,0 +1,79 @@
+"""Small tasks, each of which isolates one way to be silently wrong; for tests and for trying an agent in seconds."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+Obs = NDArray[np.float32]
+_STEP = tuple[Obs, float, bool, bool, dict[str, Any]]
+
+
+class Coin(gym.Env[Obs, Obs]):
+    """The state is a fresh fair coin ±1 at every step; reward a·s: with a delay of 1 or more nobody averages above 0."""
+
+    observation_space = Box(-1, 1, (1,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Toss the first coin."""
+        super().reset(seed=seed)
+        return self._toss(), {}
+
+    def step(self, action: Obs) -> _STEP:
+        """Pay for having guessed the coin that lies on the table, then toss the next."""
+        reward = float(action[0] * self._coin[0])
+        return self._toss(), reward, False, False, {}
+
+    def _toss(self) -> Obs:
+        self._coin = np.array([self.np_random.choice([-1.0, 1.0])], np.float32)
+        return self._coin
+
+
+class Walk(gym.Env[Obs, Obs]):
+    """s' = s + a, reward -s²: with a delay it is solved only by remembering the actions on their way."""
+
+    observation_space = Box(-10, 10, (1,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Start somewhere in [-2, 2]."""
+        super().reset(seed=seed)
+        self._position = self.np_random.uniform(-2, 2, 1).astype(np.float32)
+        return self._position, {}
+
+    def step(self, action: Obs) -> _STEP:
+        """Move by the action; pay the square of where that leads."""
+        self._position = np.clip(self._position + np.clip(action, -1, 1), -10, 10).astype(np.float32)
+        return self._position, -float(self._position[0] ** 2), False, False, {}
+
+
+class Counter(gym.Env[Obs, Obs]):
+    """Counts: observation [t, T], reward t + 1, terminates after T steps, T drawn from 4..10 (alignment shows)."""
+
+    observation_space = Box(0, 10, (2,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Draw the length, and start at 0."""
+        super().reset(seed=seed)
+        self._length = int(self.np_random.integers(4, 11))
+        self._time = 0
+        return self._obs(), {}
+
+    def step(self, action: Obs) -> _STEP:
+        """Count one step."""
+        self._time += 1
+        return self._obs(), float(self._time), self._time == self._length, False, {}
+
+    def _obs(self) -> Obs:
+        return np.array([self._time, self._length], np.float32)
+
+
+def register() -> None:
+    """Enter the probes in Gymnasium's registry (again and again does no harm)."""
+    for name, entry, limit in (("Coin", Coin, 50), ("Walk", Walk, 50), ("Counter", Counter, 1000)):
+        if f"delayrl/{name}-v0" not in gym.registry:
+            gym.register(f"delayrl/{name}-v0", entry_point=entry, max_episode_steps=limit)  # type: ignore[arg-type]

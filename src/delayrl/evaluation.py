@@ -1,0 +1,82 @@
+"""Evaluation: deterministic actions, a start state of its own for every episode, one row per episode, never a mean."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from delayrl.agents.base import Agent, State
+from delayrl.delays import DelayLaw, as_law
+from delayrl.envs import make
+from delayrl.errors import DelayRLError
+from delayrl.types import Key, Spec
+from delayrl.views import seen_now
+
+
+class Episodes(NamedTuple):
+    """Undiscounted returns and lengths, [seeds, episodes]."""
+
+    returns: NDArray[np.float64]
+    lengths: NDArray[np.int64]
+
+
+class Evaluator:
+    """Plays episodes of all seeds beside each other, one call of the policy for each step of all of them.
+
+    Args:
+        agent: whose policy is played.
+        spec: the task as the agent was trained on it.
+        env: id of the task.
+        delay: under which it is played; its maximum must not be longer than `spec.delay`.
+        seeds: length of the seed axis of the states.
+        episodes: how many for each.
+    """
+
+    def __init__(
+        self, agent: Agent, spec: Spec, env: str, delay: int | DelayLaw, seeds: int, episodes: int
+    ) -> None:
+        law = as_law(delay)
+        if law.maximum > spec.delay:
+            raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {law.maximum}")
+        self._delay = spec.delay
+        self._envs = [[make(env, law, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        single = lambda state, seen, key: agent.act(state, seen, key, explore=False)  # noqa: E731
+        self._act = jax.jit(jax.vmap(jax.vmap(single, (None, 0, 0))))
+
+    def __call__(self, states: State, reset_seeds: Sequence[Sequence[int]], keys: Key) -> Episodes:
+        """Play one episode from each reset seed, [seeds, episodes]."""
+        shape = (len(self._envs), len(self._envs[0]))
+        returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
+        seen = [
+            [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
+            for envs, seeds in zip(self._envs, reset_seeds, strict=True)
+        ]
+        split = jax.jit(jax.vmap(lambda key, step: jax.random.split(jax.random.fold_in(key, step), shape[1]), (0, None)))
+        step = 0
+        while running.any():
+            batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *sum(seen, []))
+            actions = np.asarray(self._act(states, batch, split(keys, step)))
+            step += 1
+            for i, j in np.argwhere(running):
+                obs, reward, terminated, truncated, info = self._envs[i][j].step(actions[i, j])
+                if not np.isfinite(reward):
+                    raise DelayRLError(f"the environment gave the reward {reward} in evaluation")
+                returns[i, j] += float(reward)
+                lengths[i, j] += 1
+                running[i, j] = not (terminated or truncated)
+                seen[i][j] = self._see(obs, info)
+        return Episodes(returns, lengths)
+
+    def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
+        return seen_now(obs, info, self._delay, privileged=False)
+
+
+def reset_seed(seed: int, *stream: int) -> int:
+    """A seed for one episode: the same numbers give the same seed, others an unrelated one."""
+    return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0] >> 1)
+
+
+TRAINING, EVALUATION, RANDOM_ACTIONS = 0, 1, 2
+"""Streams of `reset_seed`: start states of evaluation are none of training's."""

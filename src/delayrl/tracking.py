@@ -1,0 +1,35 @@
+"""Scalars to TensorBoard or Weights & Biases as well, where the user asked for it; the run folder has them anyway."""
+
+from pathlib import Path
+from typing import Any
+
+from delayrl.errors import DelayRLError
+
+
+class Tracker:
+    """Writes scalars to one service; with `kind` None to nowhere."""
+
+    def __init__(self, kind: str | None, path: Path):
+        self._write: Any = None
+        if kind is None:
+            return
+        if kind not in ("tensorboard", "wandb"):
+            raise DelayRLError(f"track must be tensorboard or wandb; got {kind!r}")
+        try:
+            if kind == "tensorboard":
+                from tensorboardX import SummaryWriter
+
+                writer = SummaryWriter(str(path / "tensorboard"))
+                self._write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
+            else:
+                import wandb
+
+                run = wandb.init(project="delayrl", name=str(path), dir=str(path), reinit="create_new")
+                self._write = lambda step, values: run.log(values, step=step)
+        except ImportError as error:
+            raise DelayRLError(f"--track {kind} needs `pip install 'delayrl[{kind}]'`") from error
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """Log scalars at an environment step."""
+        if self._write is not None:
+            self._write(step, values)

@@ -1,0 +1,570 @@
+"""The loop: act, store, learn, evaluate, record. No algorithm's name is in it.
+
+All seeds run in lockstep: agent states and replays have a leading seed axis, each seed has its own environment and random
+stream. Everything random is a function of (seed, step), so that a checkpoint needs no generator's state, and an
+environment is restored by playing its current episode again. While the environments simulate step t, the device learns
+from the steps before it.
+"""
+
+import functools
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from delayrl import replay as ring
+from delayrl.agents import AGENTS
+from delayrl.agents.base import Agent, Schedule, State, template
+from delayrl.config import check_names, override, values_of
+from delayrl.envs import make
+from delayrl.errors import DelayRLError
+from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, TRAINING, Evaluator, reset_seed
+from delayrl.plots import curve
+from delayrl.policy import spec_of
+from delayrl.provenance import versions
+from delayrl.runs import Arrays, Checkpoint, Run, flatten_tree, restore_tree
+from delayrl.tracking import Tracker
+from delayrl.types import Action, Key, Metrics, Seen, Spec, Transition
+from delayrl.views import seen_now
+from delayrl.wrappers import DelayedObservation
+
+Note = Callable[[str], None]
+METRICS_EVERY = 1000
+
+
+class Learner(NamedTuple):
+    """What lives on the device, each with a leading seed axis."""
+
+    agent: State
+    replay: ring.Replay
+
+
+@dataclass
+class Actor:
+    """One seed's environment, and where it is in its current episode."""
+
+    env: DelayedObservation
+    seed: int
+    privileged: bool
+    episode: int = 0
+    actions: list[NDArray[np.float32]] = field(default_factory=list)
+    seen: Seen = None  # type: ignore[assignment]
+    truth: NDArray[np.float32] = None  # type: ignore[assignment]
+
+    def reset(self) -> None:
+        """Start the next episode, from its own seed."""
+        self.actions = []
+        self._see(*self.env.reset(seed=reset_seed(self.seed, TRAINING, self.episode)))
+
+    def step(self, action: NDArray[np.float32]) -> Transition:
+        """Act; start the next episode where this one ends."""
+        before, age = self.truth, self.seen.age
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.actions.append(action)
+        self._see(obs, info)
+        reward = float(reward)
+        if not (np.isfinite(reward) and np.isfinite(self.truth).all()):
+            what = "reward" if not np.isfinite(reward) else "observation"
+            raise DelayRLError(
+                f"the environment gave a {what} that is not finite in step {len(self.actions)} of episode {self.episode}"
+            )
+        done = terminated or truncated
+        step = Transition(
+            before,  # type: ignore[arg-type]
+            age,
+            action,  # type: ignore[arg-type]
+            np.float32(reward),  # type: ignore[arg-type]
+            np.bool_(terminated),  # type: ignore[arg-type]
+            np.bool_(done),  # type: ignore[arg-type]
+            self.truth,  # type: ignore[arg-type]
+            self.seen.age,
+        )
+        if done:
+            self.episode += 1
+            self.reset()
+        return step
+
+    def replay_episode(self, episode: int, actions: NDArray[np.float32]) -> None:
+        """Come back to the middle of an episode: the same seed and actions lead to the same state."""
+        self.episode = episode
+        self.reset()
+        for action in actions:
+            obs, _, _, _, info = self.env.step(action)
+            self.actions.append(action)
+            self._see(obs, info)
+
+    def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:
+        self.seen = seen_now(obs, info, self.env.law.maximum, privileged=self.privileged)
+        self.truth = np.asarray(info["truth"], np.float32)
+
+
+class Program:
+    """The jitted functions of one agent on one task. Every argument has a leading seed axis but `step`."""
+
+    def __init__(self, agent: Agent, spec: Spec):
+        self.phases, self._agent, self._spec = agent.phases(), agent, spec
+        self._jitted_act = jax.jit(self._act)
+        self._jitted_learn = jax.jit(self._learn, static_argnames="due", donate_argnums=0)
+
+    def init(self, keys: Key, capacity: int) -> Learner:
+        """Fresh states and empty replays."""
+        states = jax.jit(jax.vmap(functools.partial(self._agent.init, self._spec)))(keys)
+        replay = jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), ring.init(self._spec, 1))
+        size = {name: (len(keys), capacity, *leaf.shape[2:]) for name, leaf in replay._asdict().items() if leaf.ndim > 1}
+        return Learner(states, replay._replace(**{n: jnp.zeros(s, getattr(replay, n).dtype) for n, s in size.items()}))
+
+    def act(self, agent: State, seen: Seen, keys: Key, step: int) -> Action:
+        """Exploring actions for all seeds, not waited for."""
+        return self._jitted_act(agent, seen, keys, np.int32(step))
+
+    def learn(
+        self, learner: Learner, transition: Transition, hidden: NDArray[np.int32], keys: Key, step: int, due: tuple[int, ...]
+    ) -> tuple[Learner, Metrics]:
+        """Store one step, and run the phases that are due; not waited for. The learner's old arrays are gone."""
+        return self._jitted_learn(learner, transition, hidden, keys, np.int32(step), due=due)
+
+    def due(self, step: int, schedule: Schedule) -> tuple[int, ...]:
+        """The phases that run once `step` steps are stored."""
+        if step <= schedule.random_steps:
+            return ()
+        return tuple(i for i, phase in enumerate(self.phases) if step % phase.every == 0)
+
+    def _act(self, agent: State, seen: Seen, keys: Key, step: Int[Array, ""]) -> Action:
+        def one(state: State, seen: Seen, key: Key) -> Action:
+            return self._agent.act(state, seen, jax.random.fold_in(key, step), explore=True)
+
+        return jax.vmap(one)(agent, seen, keys)
+
+    def _learn(
+        self,
+        learner: Learner,
+        transition: Transition,
+        hidden: Int[Array, " seeds"],
+        keys: Key,
+        step: Int[Array, ""],
+        due: tuple[int, ...],
+    ) -> tuple[Learner, Metrics]:
+        replay = jax.vmap(ring.append)(learner.replay, transition)
+        agent, metrics = learner.agent, {}
+        for index in due:
+            phase = self.phases[index]
+
+            def update(agent: State, i: Int[Array, ""], phase=phase, index=index) -> tuple[State, Metrics]:  # type: ignore[no-untyped-def]
+                count = step // phase.every * phase.updates + i
+
+                def one(agent: State, replay: ring.Replay, key: Key, hidden: Int[Array, ""]) -> tuple[State, Metrics]:
+                    for number in (step, index, i):
+                        key = jax.random.fold_in(key, number)
+                    draw, learn = jax.random.split(key)
+                    reach = (self._spec.delay, self._agent.ahead(self._spec))
+                    return phase.update(agent, ring.sample(replay, draw, phase.batch, *reach, hidden), learn, count)
+
+                return jax.vmap(one)(agent, replay, keys, hidden)
+
+            agent, new = jax.lax.scan(update, agent, jnp.arange(phase.updates))
+            metrics |= jax.tree.map(lambda x: x.mean(0), new)
+        return Learner(agent, replay), metrics
+
+
+def train(
+    agent: str,
+    env: str,
+    delay: int = 0,
+    *,
+    preset: str = "paper",
+    seed: int = 0,
+    seeds: int = 1,
+    out: str | Path | None = None,
+    device: str | None = None,
+    overwrite: bool = False,
+    track: str | None = None,
+    progress: bool = True,
+    **values: Any,
+) -> Any:
+    """Train an agent; the same call on an unfinished run resumes it, on a finished one gives it back.
+
+    Args:
+        agent: its name in the registry (`delayrl agents`).
+        env: id of a Gymnasium task (`delayrl tasks`).
+        delay: Δ, in environment steps.
+        preset: "paper" or "small": which hyperparameters to start from.
+        seed: fixes everything: environments, networks, sampling.
+        seeds: trains the seeds seed .. seed + seeds - 1 in lockstep.
+        out: the run folder; with several seeds the folder of their run folders.
+        device: "cpu" or "gpu"; None leaves the choice to JAX.
+        overwrite: start afresh where a run exists.
+        track: "tensorboard" or "wandb" as well (extras of the same names).
+        progress: show a progress bar and notes on stderr.
+        **values: any hyperparameter or schedule option by name.
+
+    Returns:
+        The run, or the list of runs where `seeds` > 1.
+
+    Raises:
+        DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
+    """
+    entry = find_agent(agent)
+    if preset not in entry.presets:
+        raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(entry.presets)}")
+    for name, number in (("seed", seed), ("seeds", seeds - 1)):
+        if number < 0:
+            raise DelayRLError(f"{name} must be {'at least 1' if name == 'seeds' else 'no less than 0'}")
+    base = entry.presets[preset]
+    check_names(values, base.agent, base.schedule)
+    config, schedule = override(base.agent, values), override(base.schedule, values)
+    group = Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / f"{agent}-{preset}"
+    single_home = group if out is not None else group / f"seed{seed}"
+    runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
+
+    note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
+    with on_device(device):
+        session = Session(config, schedule, env, delay, [seed + i for i in range(seeds)])
+        description = {
+            "agent": agent,
+            "preset": preset,
+            "env": env,
+            "delay": delay,
+            "protocol": "corrected",
+            "privileged": config.privileged,
+            "hyperparameters": values_of(config),
+            "schedule": values_of(schedule),
+        }
+        session.open(runs, description, overwrite, note)
+        session.run(note, progress, track)
+    return runs[0] if seeds == 1 else runs
+
+
+class Session:
+    """One call of `train`: the seeds' environments and learners, and where they are written."""
+
+    def __init__(self, agent: Agent, schedule: Schedule, env: str, delay: int, seeds: list[int]):
+        self.agent, self.schedule, self.env, self.delay, self.seeds = agent, schedule, env, delay, seeds
+        self.actors = [Actor(make(env, delay, rescale=True), seed, agent.privileged) for seed in seeds]
+        self.spec = spec_of(self.actors[0].env)
+        least = 2 * (self.spec.delay + agent.ahead(self.spec)) + 2
+        if schedule.replay_capacity < least:
+            raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
+        self.template = template(agent, self.spec)  # says what does not fit, before anything is stored
+        self.program = Program(agent, self.spec)
+        self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+        self.step = 0
+        self.pending: Transition | None = None
+        self.stored: list[dict[str, str]] = [{} for _ in seeds]
+        self.stored_rows = [0 for _ in seeds]
+
+    # -- the run folders -------------------------------------------------------------------------------------------
+
+    def open(self, runs: list[Run], description: dict[str, Any], overwrite: bool, note: Note) -> None:
+        """Create the folders, or resume what is there."""
+        self.runs, self.description = runs, description
+        self.learner = self.program.init(self.keys, self.schedule.replay_capacity)
+        if overwrite:
+            for run in runs:
+                run.remove()
+        for actor in self.actors:
+            actor.reset()
+        for run, seed in zip(runs, self.seeds, strict=True):
+            if (run.path / "config.json").exists():
+                self._check_same(run, description | {"seed": seed})
+            elif run.path.is_dir() and any(run.path.iterdir()):
+                raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
+            else:
+                run.create(description | {"seed": seed, "versions": versions()})
+        found = [run.checkpoints() for run in runs]
+        for line in (line for _, broken in found for line in broken):
+            note(line)
+        common = set.intersection(*({c.step for c in good} for good, _ in found))
+        if not common:
+            for (_, broken), run in zip(found, runs, strict=True):
+                if broken:
+                    raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
+                run.rewind(-1)
+            return
+        step = max(common)
+        chosen = [next(c for c in good if c.step == step) for good, _ in found]
+        if any(c.complete for c in chosen) or step:
+            note(f"{'found complete' if chosen[0].complete else 'resumed'} at step {step:,}: {runs[0].path}")
+        self._restore(chosen)
+        for run in runs:
+            run.rewind(step)
+
+    @staticmethod
+    def _check_same(run: Run, wanted: dict[str, Any]) -> None:
+        have = run.config
+        for key, value in wanted.items():
+            if isinstance(value, dict):
+                changed = [k for k in value if have.get(key, {}).get(k) != value[k]]
+            else:
+                changed = [key] if have.get(key) != value else []
+            if changed:
+                raise DelayRLError(
+                    f"{run.path} holds a run with another {', '.join(changed)}; give another --out, or --overwrite"
+                )
+
+    def _restore(self, checkpoints: list[Checkpoint]) -> None:
+        self.step = checkpoints[0].step
+        states = [restore_tree(self.template, c.arrays("agent"), c.path) for c in checkpoints]
+        self.learner = self.learner._replace(agent=jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states))
+        if checkpoints[0].complete:
+            return
+        replays, pending = [], []
+        for i, (run, checkpoint) in enumerate(zip(self.runs, checkpoints, strict=True)):
+            loop = checkpoint.arrays("loop")
+            columns = {name: np.array(column[i]) for name, column in self.learner.replay._asdict().items()}
+            for piece in sorted(checkpoint.pieces):
+                _paste(columns, run_piece(run, piece))
+            for name in ("rows", "steps", "lost"):
+                columns[name] = loop[name]
+            replays.append(ring.Replay(**columns))
+            self.stored[i], self.stored_rows[i] = dict(checkpoint.pieces), int(loop["rows"])
+            pending.append(Transition(**{name: loop[f"pending.{name}"] for name in Transition._fields}))
+            self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
+            if not np.array_equal(self.actors[i].truth, loop["truth"]):
+                raise DelayRLError(f"{self.env} does not repeat an episode from its seed, so the run cannot be resumed")
+        self.learner = self.learner._replace(replay=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays))
+        self.pending = jax.tree.map(lambda *x: np.stack(x), *pending)
+
+    def save(self, *, complete: bool = False) -> None:
+        """Write each seed's checkpoint; of the replay only what is new."""
+        if self.step == 0:
+            return
+        agent = jax.device_get(self.learner.agent)
+        for i, (run, actor) in enumerate(zip(self.runs, self.actors, strict=True)):
+            mine = flatten_tree(jax.tree.map(lambda x, i=i: x[i], agent))
+            if complete:
+                run.save(self.step, mine, None, {}, complete=True)
+                continue
+            replay = self.learner.replay
+            rows, steps, lost = (int(x[i]) for x in (replay.rows, replay.steps, replay.lost))
+            first = max(self.stored_rows[i], rows - self.schedule.replay_capacity + 1, 0)
+            name = f"{first:012d}-{rows:012d}.safetensors"
+            self.stored[i][name] = run.save_piece(name, _cut(replay, i, first, rows, steps))
+            self.stored_rows[i] = rows
+            alive = rows - self.schedule.replay_capacity
+            self.stored[i] = {n: d for n, d in self.stored[i].items() if int(n[13:25]) > alive}
+            assert self.pending is not None
+            loop: Arrays = {f"pending.{n}": np.asarray(x[i]) for n, x in self.pending._asdict().items()}
+            counts = {"rows": rows, "steps": steps, "lost": lost, "episode": actor.episode}
+            loop |= {n: np.asarray(x, np.int32) for n, x in counts.items()}
+            loop |= {"truth": actor.truth, "actions": np.reshape(actor.actions, (-1, self.spec.action_size))}
+            run.save(self.step, mine, {n: np.asarray(x) for n, x in loop.items()}, self.stored[i])
+            good, _ = run.checkpoints()
+            run.keep_pieces({name for c in good for name in c.pieces})
+
+    # -- the loop --------------------------------------------------------------------------------------------------
+
+    def run(self, note: Note, progress: bool, track: str | None) -> None:
+        """Train to the end, or until the process is asked to stop."""
+        schedule = self.schedule
+        if self.step >= schedule.steps:
+            return
+        evaluator = self._evaluators()
+        trackers = [Tracker(track, run.path) for run in self.runs]
+        began, began_step, metrics = time.perf_counter(), self.step, {}
+        note(f"estimate: {self._estimate()}") if progress else None
+        with stop_signal() as stop, tqdm(
+            total=schedule.steps, initial=self.step, unit="step", disable=not progress, smoothing=0.05, dynamic_ncols=True
+        ) as bar:
+            while self.step < schedule.steps and not stop.is_set():
+                step = self.step
+                if step > schedule.random_steps:
+                    seen = jax.tree.map(lambda *x: np.stack(x), *[actor.seen for actor in self.actors])
+                    chosen = self.program.act(self.learner.agent, seen, self.keys, step)
+                else:
+                    chosen = None
+                if self.pending is not None:
+                    self.learner, new = self.program.learn(
+                        self.learner, self.pending, self._hidden(), self.keys, step, self.program.due(step, schedule)
+                    )
+                    metrics |= new
+                actions = self._random(step) if chosen is None else np.asarray(chosen)
+                steps = [actor.step(action) for actor, action in zip(self.actors, actions, strict=True)]
+                self.pending = jax.tree.map(lambda *x: np.stack(x), *steps)
+                self.step += 1
+                bar.update(1)
+                if self.step % METRICS_EVERY == 0:
+                    speed = (self.step - began_step) / (time.perf_counter() - began)
+                    self._log(metrics, speed, trackers)
+                if self.step % schedule.evaluate_every == 0 or self.step == schedule.steps:
+                    bar.set_postfix_str(self._evaluate(evaluator, trackers))
+                    self.save(complete=self.step == schedule.steps)
+            if stop.is_set() and self.step < schedule.steps:
+                self.save()
+                raise DelayRLError(f"stopped at step {self.step:,}; the same command goes on from there")
+        for run in self.runs:
+            curve(run.read("rows"), run.path / "curve.png")
+
+    def _random(self, step: int) -> NDArray[np.float32]:
+        draws = [np.random.default_rng([seed, RANDOM_ACTIONS, step]) for seed in self.seeds]
+        return np.stack([draw.uniform(-1, 1, self.spec.action_size).astype(np.float32) for draw in draws])
+
+    def _hidden(self) -> NDArray[np.int32]:
+        """How many of the newest observations each seed's learner may not look at."""
+        return np.array([0 if self.agent.privileged else actor.seen.age for actor in self.actors], np.int32)
+
+    def _evaluators(self) -> dict[str, Evaluator]:
+        count, episodes = len(self.seeds), self.schedule.evaluation_episodes
+        evaluators = {"agent": Evaluator(self.agent, self.spec, self.env, self.delay, count, episodes)}
+        if inner := self.agent.reference_policy(self.learner.agent):
+            spec = Spec(self.spec.obs_size, self.spec.action_size, 0)
+            evaluators["reference"] = Evaluator(inner[0], spec, self.env, 0, count, episodes)
+        return evaluators
+
+    def _evaluate(self, evaluators: dict[str, Evaluator], trackers: list[Tracker]) -> str:
+        states = {"agent": self.learner.agent}
+        if inner := self.agent.reference_policy(self.learner.agent):
+            states["reference"] = inner[1]
+        summary = []
+        episodes = range(self.schedule.evaluation_episodes)
+        seeds = [[reset_seed(seed, EVALUATION, self.step, e) for e in episodes] for seed in self.seeds]
+        keys = jax.vmap(lambda key: jax.random.fold_in(key, self.step))(self.keys)
+        for policy, evaluator in evaluators.items():
+            played = evaluator(states[policy], seeds, keys)
+            summary.append(f"{policy} {played.returns.mean():.4g}")
+            for i, (run, tracker) in enumerate(zip(self.runs, trackers, strict=True)):
+                run.append("rows", [self._row(i, policy, e, seeds[i][e], played) for e in episodes])
+                tracker.write(self.step, {f"return/{policy}": float(played.returns[i].mean())})
+        return " · ".join(summary)
+
+    def _row(self, i: int, policy: str, episode: int, reset: int, played: Any) -> dict[str, Any]:
+        names = ("agent", "env", "delay", "preset", "protocol", "privileged")
+        return {name: self.description[name] for name in names} | {
+            "seed": self.seeds[i],
+            "step": self.step,
+            "policy": policy,
+            "episode": episode,
+            "reset_seed": reset,
+            "return": float(played.returns[i, episode]),
+            "length": int(played.lengths[i, episode]),
+        }
+
+    def _log(self, metrics: Metrics, speed: float, trackers: list[Tracker]) -> None:
+        values = jax.device_get(metrics)
+        for i, (run, tracker) in enumerate(zip(self.runs, trackers, strict=True)):
+            mine = {name: float(x[i]) for name, x in values.items()}
+            for name, x in mine.items():
+                if not np.isfinite(x):
+                    raise DelayRLError(
+                        f"{name} is {x} at step {self.step} of seed {self.seeds[i]}: training diverged; "
+                        "the last good checkpoint is kept"
+                    )
+            run.append("metrics", [{"step": self.step, "steps_per_second": round(speed, 2), **mine}])
+            tracker.write(self.step, mine | {"steps_per_second": speed})
+
+    def _estimate(self) -> str:
+        hours = estimate_seconds(self.program, self.learner, self.agent, self.spec, self.schedule, self.step) / 3600
+        if hours < 0.5:
+            return f"about {max(1, round(hours * 60))} min for {self.schedule.steps - self.step:,} steps on this device"
+        return f"about {hours:.1f} h for {self.schedule.steps - self.step:,} steps on this device; --preset small takes minutes"
+
+
+def estimate_seconds(
+    program: Program, learner: Learner, agent: Agent, spec: Spec, schedule: Schedule, step: int
+) -> float:
+    """A rough guess of the time to train: the updates' arithmetic, at a fraction of this device's matmul rate."""
+    square = jnp.ones((1024, 1024))
+    multiply = jax.jit(lambda x: x @ x)
+    multiply(square).block_until_ready()
+    start = time.perf_counter()
+    for _ in range(4):
+        multiply(square).block_until_ready()
+    rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
+    seconds = (schedule.steps - step) * 2e-4
+    replay = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.replay)
+    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.agent)
+    seeds = learner.replay.rows.shape[0]
+    for phase in program.phases:
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        number = jax.ShapeDtypeStruct((), jnp.int32)
+        reach = (phase.batch, spec.delay, agent.ahead(spec))
+        windows = jax.eval_shape(lambda r, k, h, reach=reach: ring.sample(r, k, *reach, h), replay, key, number)
+        cost = jax.jit(phase.update).lower(state, windows, key, number).cost_analysis()
+        flops = float((cost or {}).get("flops", 0.0))
+        rounds = (schedule.steps - max(step, schedule.random_steps)) / phase.every
+        seconds += max(rounds, 0) * phase.updates * seeds * (flops / (UTILISATION * rate) + 3e-4)
+    return seconds
+
+
+UTILISATION = 0.25
+"""Share of the matmul rate that an update reaches on a CPU, measured on presets `small` and `paper`."""
+
+
+def find_agent(name: str) -> Any:
+    """The agent's line in the registry; DelayRLError with the nearest names."""
+    import difflib
+
+    if name not in AGENTS:
+        near = difflib.get_close_matches(name, AGENTS, n=2, cutoff=0.4) or AGENTS
+        raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")
+    return AGENTS[name]
+
+
+@contextmanager
+def on_device(name: str | None) -> Iterator[None]:
+    """Run on "cpu" or "gpu"; None leaves the choice to JAX."""
+    if name is None:
+        yield
+        return
+    if name not in ("cpu", "gpu"):
+        raise DelayRLError(f"device must be cpu or gpu; got {name!r}")
+    try:
+        device = jax.devices(name)[0]
+    except RuntimeError as error:
+        raise DelayRLError(f"JAX finds no {name}; `pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu") from error
+    with jax.default_device(device):
+        yield
+
+
+@contextmanager
+def stop_signal() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or a polite kill sets, instead of ending the process in the middle of a step."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(kind, lambda *_: event.set()) for kind in kinds]
+    try:
+        yield event
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
+
+
+def run_piece(run: Run, name: str) -> Arrays:
+    """One stored piece of a run's replay."""
+    from delayrl.runs import load_arrays
+
+    return load_arrays(run.path / "replay" / name)
+
+
+def _cut(replay: ring.Replay, seed: int, first: int, last: int, steps: int) -> Arrays:
+    """Rows first..last of one seed's ring, and the steps that start in them."""
+    capacity = replay.obs.shape[1]
+    index = np.arange(first, last + 1) % capacity
+    columns = ("obs", "action", "reward", "age", "terminated", "moment")
+    piece: Arrays = {name: np.asarray(getattr(replay, name)[seed][index]) for name in columns}
+    numbers = np.arange(max(0, steps - capacity), steps)
+    row_of = np.asarray(replay.row_of[seed])[numbers % capacity]
+    mine = row_of >= first
+    return piece | {"rows": np.arange(first, last + 1), "steps": numbers[mine], "row_of": row_of[mine]}
+
+
+def _paste(columns: Arrays, piece: Arrays) -> None:
+    """Put a piece back where `_cut` took it from."""
+    capacity = len(columns["obs"])
+    for name in ("obs", "action", "reward", "age", "terminated", "moment"):
+        columns[name][piece["rows"] % capacity] = piece[name]
+    columns["row_of"][piece["steps"] % capacity] = piece["row_of"]
