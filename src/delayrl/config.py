@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
@@ -63,9 +63,9 @@ def override(config: Any, values: Mapping[str, Any]) -> Any:
     return replace(config, **changes)
 
 
-def check_names(values: Mapping[str, Any], *configs: Any) -> None:
-    """DelayRLError, with the nearest names, for a value that is an option of none of the dataclasses."""
-    known = [option.name for config in configs for option in options(config)]
+def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) -> None:
+    """DelayRLError, with the nearest names, for a name that is no option of the dataclasses and not among `also`."""
+    known = [option.name for config in configs for option in options(config)] + list(also)
     for name in values:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)

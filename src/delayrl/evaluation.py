@@ -1,6 +1,7 @@
 """Evaluation: deterministic actions, a start state of its own for every episode, one row per episode, never a mean."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,8 @@ from delayrl.agents.base import Agent, State
 from delayrl.delays import DelayLaw, as_law
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
+from delayrl.policy import load
+from delayrl.runs import Run
 from delayrl.types import Key, Spec
 from delayrl.views import seen_now
 
@@ -34,9 +37,7 @@ class Evaluator:
         episodes: how many for each.
     """
 
-    def __init__(
-        self, agent: Agent, spec: Spec, env: str, delay: int | DelayLaw, seeds: int, episodes: int
-    ) -> None:
+    def __init__(self, agent: Agent, spec: Spec, env: str, delay: int | DelayLaw, seeds: int, episodes: int) -> None:
         law = as_law(delay)
         if law.maximum > spec.delay:
             raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {law.maximum}")
@@ -53,7 +54,9 @@ class Evaluator:
             [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
-        split = jax.jit(jax.vmap(lambda key, step: jax.random.split(jax.random.fold_in(key, step), shape[1]), (0, None)))
+        split = jax.jit(
+            jax.vmap(lambda key, step: jax.random.split(jax.random.fold_in(key, step), shape[1]), (0, None))
+        )
         step = 0
         while running.any():
             batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *sum(seen, []))
@@ -78,5 +81,39 @@ def reset_seed(seed: int, *stream: int) -> int:
     return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0] >> 1)
 
 
-TRAINING, EVALUATION, RANDOM_ACTIONS = 0, 1, 2
-"""Streams of `reset_seed`: start states of evaluation are none of training's."""
+TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
+"""Streams of `reset_seed`: start states of evaluation are none of training's, those of `evaluate` none of either."""
+
+
+def evaluate(run: str | Path, episodes: int = 10, delay: int | None = None, seed: int = 0) -> dict[str, Any]:
+    """Play the policy of a run folder on start states that it never saw.
+
+    Args:
+        run: the run folder.
+        episodes: how many.
+        delay: any delay that it can serve; None for the one it was trained for.
+        seed: of the start states.
+
+    Returns:
+        agent, env, delay, episodes, mean_return, std_return, returns.
+
+    Raises:
+        DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
+    """
+    if episodes < 1 or seed < 0:
+        raise DelayRLError(f"episodes must be at least 1 and seed no less than 0; got {episodes} and {seed}")
+    policy, config = load(run), Run(Path(run)).config
+    delay = config["delay"] if delay is None else delay
+    evaluator = Evaluator(policy.agent, policy.spec, config["env"], delay, 1, episodes)
+    states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
+    seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
+    returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
+    return {
+        "agent": config["agent"],
+        "env": config["env"],
+        "delay": delay,
+        "episodes": episodes,
+        "mean_return": float(returns.mean()),
+        "std_return": float(returns.std()),
+        "returns": returns.tolist(),
+    }

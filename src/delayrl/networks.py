@@ -1,6 +1,6 @@
 """Networks as pure functions on plain trees of arrays: `*_init(key, …) -> params`, then `network(params, x)`."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from delayrl.types import Action, Key
 
-Params = dict[str, "Params"] | list["Params"] | Array
+Params = Any
+"""A tree (dicts and lists) of arrays."""
 LogStdBounds = Literal["rescale", "clip"]
 
 
@@ -32,7 +33,7 @@ def linear_init(key: Key, inputs: int, outputs: int, std: float | None = None) -
 
 
 def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-    """x W + b."""
+    """X W + b."""
     return x @ params["w"] + params["b"]
 
 
@@ -50,7 +51,10 @@ def mlp(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batc
 
 
 def gaussian(
-    params: Params, x: Float[Array, "*batch inputs"], log_std_range: tuple[float, float], bounds: LogStdBounds = "rescale"
+    params: Params,
+    x: Float[Array, "*batch inputs"],
+    log_std_range: tuple[float, float],
+    bounds: LogStdBounds = "rescale",
 ) -> Gaussian:
     """An `mlp` whose outputs are mean and log-std; the log-std is kept in its range by a rescaled tanh, or clipped."""
     mean, log_std = jnp.split(mlp(params, x), 2, -1)
@@ -101,7 +105,7 @@ def dropout(key: Key | None, rate: float, x: Float[Array, "*shape"]) -> Float[Ar
 
 
 def transformer_init(key: Key, obs_size: int, action_size: int, length: int, width: int, layers: int) -> Params:
-    """Weights N(0, 0.02²), biases 0, layer norms 1 and 0, as the released code; its q, k, v are Xavier-uniform there too."""
+    """Weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform: as the released code of VDPO."""
     keys = iter(jax.random.split(key, 4 + 4 * layers))
 
     def normed() -> Params:
@@ -149,7 +153,11 @@ def transformer(
         key: for dropout; None switches it off.
     """
     length, width = params["position"].shape
-    keys = iter([None] * (1 + 3 * len(params["blocks"])) if key is None else jax.random.split(key, 1 + 3 * len(params["blocks"])))
+    keys = iter(
+        [None] * (1 + 3 * len(params["blocks"]))
+        if key is None
+        else jax.random.split(key, 1 + 3 * len(params["blocks"]))
+    )
     # join([e_obs, e_action]) as two products: the observation's half is the same for every token
     w_obs, w_action = jnp.split(params["join"]["w"], 2)
     from_obs = linear(params["obs"], obs) @ w_obs + params["join"]["b"]

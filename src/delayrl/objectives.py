@@ -20,7 +20,7 @@ def soft_target(
     terminated: Bool[Array, "*batch"],
     next_value: Float[Array, "*batch"],
 ) -> Float[Array, "*batch"]:
-    """y = R + γ^k (1 - terminated) V(s_{t+k}) (VDPO eq. max_pe, with k steps); a time limit is no termination."""
+    """Y = R + γ^k (1 - terminated) V(s_{t+k}) (VDPO eq. max_pe, with k steps); a time limit is no termination."""
     return reward + discount * jnp.where(terminated, 0, next_value)
 
 

@@ -79,7 +79,7 @@ def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden:
         batch: how many windows.
         delay: Δ, the rows before the step.
         ahead: the rows after it; the longest k of a k-step target.
-        hidden: how many of the newest observations have not arrived yet: the learner's current age, 0 if it may see all.
+        hidden: how many of the newest observations have not arrived yet: the learner's age, 0 if it may see all.
 
     Returns:
         Windows with a leading axis `batch`.

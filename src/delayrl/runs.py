@@ -162,7 +162,7 @@ class Run:
 
 def save_arrays(path: Path, arrays: Arrays) -> str:
     """Write arrays as safetensors, flushed to the disk; returns the file's checksum."""
-    data = safetensors.numpy.save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+    data = safetensors.numpy.save({name: np.array(array, order="C") for name, array in arrays.items()})
     _write(path, data, rename=False)
     return hashlib.sha256(data).hexdigest()
 

@@ -1,181 +1,45 @@
 """The loop: act, store, learn, evaluate, record. No algorithm's name is in it.
 
-All seeds run in lockstep: agent states and replays have a leading seed axis, each seed has its own environment and random
-stream. Everything random is a function of (seed, step), so that a checkpoint needs no generator's state, and an
+All seeds run in lockstep: agent states and replays have a leading seed axis, each seed has its own environment and
+random stream. Everything random is a function of (seed, step), so that a checkpoint needs no generator's state, and an
 environment is restored by playing its current episode again. While the environments simulate step t, the device learns
 from the steps before it.
 """
 
-import functools
+import difflib
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from delayrl import replay as ring
+from delayrl.acting import Actor
 from delayrl.agents import AGENTS
-from delayrl.agents.base import Agent, Schedule, State, template
+from delayrl.agents.base import Agent, Schedule, template
 from delayrl.config import check_names, override, values_of
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
-from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, TRAINING, Evaluator, reset_seed
+from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, reset_seed
+from delayrl.learning import Program, estimate_seconds
 from delayrl.plots import curve
 from delayrl.policy import spec_of
 from delayrl.provenance import versions
-from delayrl.runs import Arrays, Checkpoint, Run, flatten_tree, restore_tree
+from delayrl.runs import Arrays, Checkpoint, Run, flatten_tree, load_arrays, restore_tree
 from delayrl.tracking import Tracker
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Transition
-from delayrl.views import seen_now
-from delayrl.wrappers import DelayedObservation
+from delayrl.types import Metrics, Spec, Transition
 
 Note = Callable[[str], None]
 METRICS_EVERY = 1000
-
-
-class Learner(NamedTuple):
-    """What lives on the device, each with a leading seed axis."""
-
-    agent: State
-    replay: ring.Replay
-
-
-@dataclass
-class Actor:
-    """One seed's environment, and where it is in its current episode."""
-
-    env: DelayedObservation
-    seed: int
-    privileged: bool
-    episode: int = 0
-    actions: list[NDArray[np.float32]] = field(default_factory=list)
-    seen: Seen = None  # type: ignore[assignment]
-    truth: NDArray[np.float32] = None  # type: ignore[assignment]
-
-    def reset(self) -> None:
-        """Start the next episode, from its own seed."""
-        self.actions = []
-        self._see(*self.env.reset(seed=reset_seed(self.seed, TRAINING, self.episode)))
-
-    def step(self, action: NDArray[np.float32]) -> Transition:
-        """Act; start the next episode where this one ends."""
-        before, age = self.truth, self.seen.age
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        self.actions.append(action)
-        self._see(obs, info)
-        reward = float(reward)
-        if not (np.isfinite(reward) and np.isfinite(self.truth).all()):
-            what = "reward" if not np.isfinite(reward) else "observation"
-            raise DelayRLError(
-                f"the environment gave a {what} that is not finite in step {len(self.actions)} of episode {self.episode}"
-            )
-        done = terminated or truncated
-        step = Transition(
-            before,  # type: ignore[arg-type]
-            age,
-            action,  # type: ignore[arg-type]
-            np.float32(reward),  # type: ignore[arg-type]
-            np.bool_(terminated),  # type: ignore[arg-type]
-            np.bool_(done),  # type: ignore[arg-type]
-            self.truth,  # type: ignore[arg-type]
-            self.seen.age,
-        )
-        if done:
-            self.episode += 1
-            self.reset()
-        return step
-
-    def replay_episode(self, episode: int, actions: NDArray[np.float32]) -> None:
-        """Come back to the middle of an episode: the same seed and actions lead to the same state."""
-        self.episode = episode
-        self.reset()
-        for action in actions:
-            obs, _, _, _, info = self.env.step(action)
-            self.actions.append(action)
-            self._see(obs, info)
-
-    def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:
-        self.seen = seen_now(obs, info, self.env.law.maximum, privileged=self.privileged)
-        self.truth = np.asarray(info["truth"], np.float32)
-
-
-class Program:
-    """The jitted functions of one agent on one task. Every argument has a leading seed axis but `step`."""
-
-    def __init__(self, agent: Agent, spec: Spec):
-        self.phases, self._agent, self._spec = agent.phases(), agent, spec
-        self._jitted_act = jax.jit(self._act)
-        self._jitted_learn = jax.jit(self._learn, static_argnames="due", donate_argnums=0)
-
-    def init(self, keys: Key, capacity: int) -> Learner:
-        """Fresh states and empty replays."""
-        states = jax.jit(jax.vmap(functools.partial(self._agent.init, self._spec)))(keys)
-        replay = jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), ring.init(self._spec, 1))
-        size = {name: (len(keys), capacity, *leaf.shape[2:]) for name, leaf in replay._asdict().items() if leaf.ndim > 1}
-        return Learner(states, replay._replace(**{n: jnp.zeros(s, getattr(replay, n).dtype) for n, s in size.items()}))
-
-    def act(self, agent: State, seen: Seen, keys: Key, step: int) -> Action:
-        """Exploring actions for all seeds, not waited for."""
-        return self._jitted_act(agent, seen, keys, np.int32(step))
-
-    def learn(
-        self, learner: Learner, transition: Transition, hidden: NDArray[np.int32], keys: Key, step: int, due: tuple[int, ...]
-    ) -> tuple[Learner, Metrics]:
-        """Store one step, and run the phases that are due; not waited for. The learner's old arrays are gone."""
-        return self._jitted_learn(learner, transition, hidden, keys, np.int32(step), due=due)
-
-    def due(self, step: int, schedule: Schedule) -> tuple[int, ...]:
-        """The phases that run once `step` steps are stored."""
-        if step <= schedule.random_steps:
-            return ()
-        return tuple(i for i, phase in enumerate(self.phases) if step % phase.every == 0)
-
-    def _act(self, agent: State, seen: Seen, keys: Key, step: Int[Array, ""]) -> Action:
-        def one(state: State, seen: Seen, key: Key) -> Action:
-            return self._agent.act(state, seen, jax.random.fold_in(key, step), explore=True)
-
-        return jax.vmap(one)(agent, seen, keys)
-
-    def _learn(
-        self,
-        learner: Learner,
-        transition: Transition,
-        hidden: Int[Array, " seeds"],
-        keys: Key,
-        step: Int[Array, ""],
-        due: tuple[int, ...],
-    ) -> tuple[Learner, Metrics]:
-        replay = jax.vmap(ring.append)(learner.replay, transition)
-        agent, metrics = learner.agent, {}
-        for index in due:
-            phase = self.phases[index]
-
-            def update(agent: State, i: Int[Array, ""], phase=phase, index=index) -> tuple[State, Metrics]:  # type: ignore[no-untyped-def]
-                count = step // phase.every * phase.updates + i
-
-                def one(agent: State, replay: ring.Replay, key: Key, hidden: Int[Array, ""]) -> tuple[State, Metrics]:
-                    for number in (step, index, i):
-                        key = jax.random.fold_in(key, number)
-                    draw, learn = jax.random.split(key)
-                    reach = (self._spec.delay, self._agent.ahead(self._spec))
-                    return phase.update(agent, ring.sample(replay, draw, phase.batch, *reach, hidden), learn, count)
-
-                return jax.vmap(one)(agent, replay, keys, hidden)
-
-            agent, new = jax.lax.scan(update, agent, jnp.arange(phase.updates))
-            metrics |= jax.tree.map(lambda x: x.mean(0), new)
-        return Learner(agent, replay), metrics
 
 
 def train(
@@ -224,7 +88,9 @@ def train(
     base = entry.presets[preset]
     check_names(values, base.agent, base.schedule)
     config, schedule = override(base.agent, values), override(base.schedule, values)
-    group = Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / f"{agent}-{preset}"
+    group = (
+        Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / f"{agent}-{preset}"
+    )
     single_home = group if out is not None else group / f"seed{seed}"
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
@@ -316,7 +182,9 @@ class Session:
     def _restore(self, checkpoints: list[Checkpoint]) -> None:
         self.step = checkpoints[0].step
         states = [restore_tree(self.template, c.arrays("agent"), c.path) for c in checkpoints]
-        self.learner = self.learner._replace(agent=jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states))
+        self.learner = self.learner._replace(
+            agent=jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
+        )
         if checkpoints[0].complete:
             return
         replays, pending = [], []
@@ -324,12 +192,12 @@ class Session:
             loop = checkpoint.arrays("loop")
             columns = {name: np.array(column[i]) for name, column in self.learner.replay._asdict().items()}
             for piece in sorted(checkpoint.pieces):
-                _paste(columns, run_piece(run, piece))
+                _paste(columns, load_arrays(run.path / "replay" / piece))
             for name in ("rows", "steps", "lost"):
                 columns[name] = loop[name]
-            replays.append(ring.Replay(**columns))
+            replays.append(ring.Replay(**columns))  # type: ignore[arg-type]
             self.stored[i], self.stored_rows[i] = dict(checkpoint.pieces), int(loop["rows"])
-            pending.append(Transition(**{name: loop[f"pending.{name}"] for name in Transition._fields}))
+            pending.append(Transition(**{name: loop[f"pending.{name}"] for name in Transition._fields}))  # type: ignore[arg-type]
             self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
             if not np.array_equal(self.actors[i].truth, loop["truth"]):
                 raise DelayRLError(f"{self.env} does not repeat an episode from its seed, so the run cannot be resumed")
@@ -372,11 +240,20 @@ class Session:
             return
         evaluator = self._evaluators()
         trackers = [Tracker(track, run.path) for run in self.runs]
-        began, began_step, metrics = time.perf_counter(), self.step, {}
+        began, began_step, metrics = time.perf_counter(), self.step, dict[str, Any]()
         note(f"estimate: {self._estimate()}") if progress else None
-        with stop_signal() as stop, tqdm(
-            total=schedule.steps, initial=self.step, unit="step", disable=not progress, smoothing=0.05, dynamic_ncols=True
-        ) as bar:
+        with (
+            stop_signal() as stop,
+            tqdm(
+                total=schedule.steps,
+                initial=self.step,
+                unit="step",
+                disable=not progress,
+                smoothing=0.05,
+                dynamic_ncols=True,
+                mininterval=0.5 if sys.stderr.isatty() else 30,
+            ) as bar,
+        ):
             while self.step < schedule.steps and not stop.is_set():
                 step = self.step
                 if step > schedule.random_steps:
@@ -386,7 +263,12 @@ class Session:
                     chosen = None
                 if self.pending is not None:
                     self.learner, new = self.program.learn(
-                        self.learner, self.pending, self._hidden(), self.keys, step, self.program.due(step, schedule)
+                        self.learner,
+                        self.pending,
+                        self._hidden(),
+                        self.keys,
+                        step,
+                        self.program.due(step, schedule),
                     )
                     metrics |= new
                 actions = self._random(step) if chosen is None else np.asarray(chosen)
@@ -465,46 +347,14 @@ class Session:
 
     def _estimate(self) -> str:
         hours = estimate_seconds(self.program, self.learner, self.agent, self.spec, self.schedule, self.step) / 3600
+        steps = f"for {self.schedule.steps - self.step:,} steps on this device"
         if hours < 0.5:
-            return f"about {max(1, round(hours * 60))} min for {self.schedule.steps - self.step:,} steps on this device"
-        return f"about {hours:.1f} h for {self.schedule.steps - self.step:,} steps on this device; --preset small takes minutes"
-
-
-def estimate_seconds(
-    program: Program, learner: Learner, agent: Agent, spec: Spec, schedule: Schedule, step: int
-) -> float:
-    """A rough guess of the time to train: the updates' arithmetic, at a fraction of this device's matmul rate."""
-    square = jnp.ones((1024, 1024))
-    multiply = jax.jit(lambda x: x @ x)
-    multiply(square).block_until_ready()
-    start = time.perf_counter()
-    for _ in range(4):
-        multiply(square).block_until_ready()
-    rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
-    seconds = (schedule.steps - step) * 2e-4
-    replay = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.replay)
-    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.agent)
-    seeds = learner.replay.rows.shape[0]
-    for phase in program.phases:
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        number = jax.ShapeDtypeStruct((), jnp.int32)
-        reach = (phase.batch, spec.delay, agent.ahead(spec))
-        windows = jax.eval_shape(lambda r, k, h, reach=reach: ring.sample(r, k, *reach, h), replay, key, number)
-        cost = jax.jit(phase.update).lower(state, windows, key, number).cost_analysis()
-        flops = float((cost or {}).get("flops", 0.0))
-        rounds = (schedule.steps - max(step, schedule.random_steps)) / phase.every
-        seconds += max(rounds, 0) * phase.updates * seeds * (flops / (UTILISATION * rate) + 3e-4)
-    return seconds
-
-
-UTILISATION = 0.25
-"""Share of the matmul rate that an update reaches on a CPU, measured on presets `small` and `paper`."""
+            return f"about {max(1, round(hours * 60))} min {steps}"
+        return f"about {hours:.1f} h {steps}; --preset small takes minutes"
 
 
 def find_agent(name: str) -> Any:
     """The agent's line in the registry; DelayRLError with the nearest names."""
-    import difflib
-
     if name not in AGENTS:
         near = difflib.get_close_matches(name, AGENTS, n=2, cutoff=0.4) or AGENTS
         raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")
@@ -522,7 +372,9 @@ def on_device(name: str | None) -> Iterator[None]:
     try:
         device = jax.devices(name)[0]
     except RuntimeError as error:
-        raise DelayRLError(f"JAX finds no {name}; `pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu") from error
+        raise DelayRLError(
+            f"JAX finds no {name}; `pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu"
+        ) from error
     with jax.default_device(device):
         yield
 
@@ -541,13 +393,6 @@ def stop_signal() -> Iterator[threading.Event]:
     finally:
         for kind, handler in zip(kinds, before, strict=True):
             signal.signal(kind, handler)
-
-
-def run_piece(run: Run, name: str) -> Arrays:
-    """One stored piece of a run's replay."""
-    from delayrl.runs import load_arrays
-
-    return load_arrays(run.path / "replay" / name)
 
 
 def _cut(replay: ring.Replay, seed: int, first: int, last: int, steps: int) -> Arrays:

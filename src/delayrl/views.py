@@ -14,7 +14,10 @@ Sees = Literal["current", "delayed", "augmented"]
 
 
 def view(
-    window: Window, ahead: int | Int[Array, ""] = 0, delay: int | None = None, age: Int[Array, ""] | None = None
+    window: Window,
+    ahead: int | Int[Array, ""] = 0,
+    delay: int | None = None,
+    age: Int[Array, ""] | None = None,
 ) -> Seen:
     """What was known at step t + `ahead` of the window.
 

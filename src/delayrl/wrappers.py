@@ -42,7 +42,7 @@ class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], N
       age      (int)             steps since the shown observation was made, 0..Δ
       actions  (float [Δ, A])    the actions since then, oldest first, zeros after the first `age`
       mask     (bool [Δ])        true for the first `age` slots
-      truth    (float [S])       the true current observation: for privileged learners and for tests, never for the agent
+      truth    (float [S])       the true current observation: for privileged learners and tests, never for the agent
 
     Args:
         env: any Gymnasium environment with flat Box observations and actions.

@@ -20,9 +20,7 @@ def _soft(summary: str, paper: str, **sees: str) -> Entry:
     return Entry(summary, paper, presets)
 
 
-_small_vdpo = VDPO(
-    SAC(batch_size=128), width=64, layers=2, dropout=0.0, clone_every=250, clone_updates=250
-)
+_small_vdpo = VDPO(SAC(batch_size=128), width=64, layers=2, dropout=0.0, clone_every=250, clone_updates=250)
 
 AGENTS: dict[str, Entry] = {
     "vdpo": Entry(
@@ -49,5 +47,9 @@ AGENTS: dict[str, Entry] = {
         critic_sees="delayed",
     ),
     "sac": _soft("the delay-free reference: trains with --delay 0", "Haarnoja et al., ICML 2018"),
-    "random": Entry("uniform actions", "-", {name: Preset(Random(), s) for name, s in (("paper", _PAPER), ("small", _SMALL))}),
+    "random": Entry(
+        "uniform actions",
+        "-",
+        {name: Preset(Random(), s) for name, s in (("paper", _PAPER), ("small", _SMALL))},
+    ),
 }

@@ -52,7 +52,7 @@ class Agent(Protocol):
         """An action in [-1, 1]; without `explore` deterministic, and `seen.truth` is None."""
         ...
 
-    def reference(self, state: State) -> "tuple[Agent, State] | None":
+    def reference_policy(self, state: State) -> "tuple[Agent, State] | None":
         """The delay-free policy inside it, where there is one: evaluated beside it, without delay."""
         ...
 
@@ -89,7 +89,11 @@ def template(agent: Agent, spec: Spec) -> State:
 
 
 def descend(
-    optimiser: optax.GradientTransformation, loss: Callable[..., Any], params: Params, memory: optax.OptState, *args: Any
+    optimiser: optax.GradientTransformation,
+    loss: Callable[..., Any],
+    params: Params,
+    memory: optax.OptState,
+    *args: Any,
 ) -> tuple[Params, optax.OptState, Any, Any]:
     """One step of gradient descent on `loss(params, *args) -> (value, extra)`.
 

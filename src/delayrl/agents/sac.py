@@ -60,7 +60,10 @@ class SAC:
     n_steps: Annotated[int, "longest k of the k-step targets; k is drawn from 1..n_steps"] = 3
     actor_every: Annotated[int, "critic updates between two rounds of actor updates"] = 2
     actor_updates: Annotated[int, "actor updates in a round"] = 2
-    log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-5.0, 2.0)
+    log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (
+        -5.0,
+        2.0,
+    )
     log_std_bounds: Annotated[LogStdBounds, "how it is kept there"] = "rescale"
     batch_size: Annotated[int, "windows in a batch"] = 256
     update_every: Annotated[int, "environment steps between two rounds of updates"] = 1
@@ -161,7 +164,12 @@ class SAC:
             draw, redraw = jax.random.split(update_key)
             temperature = jnp.exp(state.log_temperature)
             actor, actor_memory, _, _ = descend(
-                optax.adam(self.actor_learning_rate), actor_loss, state.actor, state.actor_memory, temperature, draw
+                optax.adam(self.actor_learning_rate),
+                actor_loss,
+                state.actor,
+                state.actor_memory,
+                temperature,
+                draw,
             )
             _, log_prob = networks.sample(self.policy(actor, actor_input), redraw)
             log_temperature, temperature_memory, _, _ = descend(

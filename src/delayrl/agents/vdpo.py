@@ -67,7 +67,8 @@ class VDPO:
     clone_updates: Annotated[int, "KL updates in a round, each on a fresh batch"] = 1000
     direction: Annotated[Direction, "KL(delayed‖reference), or forward: KL(reference‖delayed)"] = "reverse"
     behaviour: Annotated[
-        Behaviour, "who acts in training: of both policies' samples the one with the lower Q, one of them, or a coin flip"
+        Behaviour,
+        "who acts in training: of both policies' samples the one with the lower Q, one of them, or a coin flip",
     ] = "lower-q"
 
     @property
@@ -115,13 +116,16 @@ class VDPO:
         dropout_key, delayed_key, reference_key, coin_key = jax.random.split(key, 4)
         every_age = self.policy(state, seen.obs, seen.actions, dropout_key if explore else None)
         current = self.reference.policy(state.reference.actor, seen.obs)
-        policy = Gaussian(*(jnp.where(seen.age > 0, d[seen.age - 1], c) for d, c in zip(every_age, current, strict=True)))
+        policy = Gaussian(
+            *(jnp.where(seen.age > 0, d[seen.age - 1], c) for d, c in zip(every_age, current, strict=True))
+        )
         if not explore:
             return networks.mode(policy)
         delayed, _ = networks.sample(policy, delayed_key)
         if self.behaviour == "delayed":
             return delayed
         truth = seen.truth
+        assert truth is not None, "behaviour with the reference is privileged"
         reference, _ = networks.sample(self.reference.policy(state.reference.actor, truth), reference_key)
         if self.behaviour == "reference":
             return reference
@@ -166,7 +170,9 @@ class VDPO:
         """The delayed policy for every age 1..Δ: [..., Δ, A]."""
         return self.reference.policy(state.head, self.encode(state.encoder, obs, actions, key))
 
-    def encode(self, encoder: Params, obs: Array, actions: Array, key: Key | None) -> Float[Array, "*batch delay width"]:
+    def encode(
+        self, encoder: Params, obs: Array, actions: Array, key: Key | None
+    ) -> Float[Array, "*batch delay width"]:
         """What the heads read at each age. `mlp`: the augmented state of that age itself."""
         if self.representation != "mlp":
             return networks.transformer(encoder, obs, actions, self.dropout, key)

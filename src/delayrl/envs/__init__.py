@@ -19,7 +19,17 @@ from delayrl.wrappers import DelayedObservation, check_spaces
 
 probe.register()
 
-PAPER_TASKS = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Pusher", "Reacher", "Swimmer", "Walker2d")
+PAPER_TASKS = (
+    "Ant",
+    "HalfCheetah",
+    "Hopper",
+    "Humanoid",
+    "HumanoidStandup",
+    "Pusher",
+    "Reacher",
+    "Swimmer",
+    "Walker2d",
+)
 
 
 def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **options: Any) -> DelayedObservation:
@@ -39,11 +49,12 @@ def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **option
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             task = gym.make(env, disable_env_checker=True, **options)
-    except (gym.error.Error, ModuleNotFoundError, ImportError) as error:
+    except Exception as error:  # a task's own constructor may raise anything
+        if env in gym.registry:
+            raise DelayRLError(f"task {env!r} cannot be made here: {_first_line(error)}") from error
         near = difflib.get_close_matches(env, gym.registry, n=3, cutoff=0.5)
         hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists the tasks we know"
-        reason = "unknown task" if env not in gym.registry else f"task cannot be made ({_first_line(error)}):"
-        raise DelayRLError(f"{reason} {env!r}; {hint}") from error
+        raise DelayRLError(f"unknown task {env!r}; {hint}") from error
     check_spaces(task)
     if rescale:
         task = RescaleAction(task, np.float32(-1), np.float32(1))

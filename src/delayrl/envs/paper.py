@@ -63,9 +63,7 @@ def register() -> None:
             reward_threshold=origin.reward_threshold,
             kwargs={"xml_file": "pusher.xml"} if pusher else {},
             additional_wrappers=(
-                (MuJoCo2.wrapper_spec(), RewardBeforeStep.wrapper_spec())
-                if pusher
-                else (MuJoCo2.wrapper_spec(),)
+                (MuJoCo2.wrapper_spec(), RewardBeforeStep.wrapper_spec()) if pusher else (MuJoCo2.wrapper_spec(),)
             ),
         )
 
@@ -87,9 +85,7 @@ class MuJoCo2(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gymnasium.Wrapper.__init__(self, env)
         restore_physics(self.unwrapped)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset, and show a free joint's orientation as a unit quaternion, as MuJoCo did before 3.2."""
         base: Any = self.unwrapped
         restore_physics(base)  # an environment that was pickled comes back with a newly loaded model

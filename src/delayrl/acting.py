@@ -1,0 +1,72 @@
+"""The host's side of one seed: its environment, and where it is in its current episode."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delayrl.errors import DelayRLError
+from delayrl.evaluation import TRAINING, reset_seed
+from delayrl.types import Seen, Transition
+from delayrl.views import seen_now
+from delayrl.wrappers import DelayedObservation
+
+
+@dataclass
+class Actor:
+    """One seed's environment, and where it is in its current episode."""
+
+    env: DelayedObservation
+    seed: int
+    privileged: bool
+    episode: int = 0
+    actions: list[NDArray[np.float32]] = field(default_factory=list)
+    seen: Seen = None  # type: ignore[assignment]
+    truth: NDArray[np.float32] = None  # type: ignore[assignment]
+
+    def reset(self) -> None:
+        """Start the next episode, from its own seed."""
+        self.actions = []
+        self._see(*self.env.reset(seed=reset_seed(self.seed, TRAINING, self.episode)))
+
+    def step(self, action: NDArray[np.float32]) -> Transition:
+        """Act; start the next episode where this one ends."""
+        before, age = self.truth, self.seen.age
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.actions.append(action)
+        self._see(obs, info)
+        reward = float(reward)
+        if not (np.isfinite(reward) and np.isfinite(self.truth).all()):
+            what = "reward" if not np.isfinite(reward) else "observation"
+            raise DelayRLError(
+                f"the environment gave a {what} that is not finite in step {len(self.actions)} of episode {self.episode}"
+            )
+        done = terminated or truncated
+        step = Transition(
+            before,  # type: ignore[arg-type]
+            age,
+            action,  # type: ignore[arg-type]
+            np.float32(reward),  # type: ignore[arg-type]
+            np.bool_(terminated),  # type: ignore[arg-type]
+            np.bool_(done),  # type: ignore[arg-type]
+            self.truth,  # type: ignore[arg-type]
+            self.seen.age,
+        )
+        if done:
+            self.episode += 1
+            self.reset()
+        return step
+
+    def replay_episode(self, episode: int, actions: NDArray[np.float32]) -> None:
+        """Come back to the middle of an episode: the same seed and actions lead to the same state."""
+        self.episode = episode
+        self.reset()
+        for action in actions:
+            obs, _, _, _, info = self.env.step(action)
+            self.actions.append(action)
+            self._see(obs, info)
+
+    def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:
+        self.seen = seen_now(obs, info, self.env.law.maximum, privileged=self.privileged)
+        self.truth = np.asarray(info["truth"], np.float32)

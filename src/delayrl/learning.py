@@ -1,0 +1,141 @@
+"""The device's side: agent states and replays of all seeds, and the jitted functions on them."""
+
+import functools
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+from numpy.typing import NDArray
+
+from delayrl import replay as ring
+from delayrl.agents.base import Agent, Schedule, State
+from delayrl.types import Action, Key, Metrics, Seen, Spec, Transition
+
+
+class Learner(NamedTuple):
+    """What lives on the device, each with a leading seed axis."""
+
+    agent: State
+    replay: ring.Replay
+
+
+class Program:
+    """The jitted functions of one agent on one task. Every argument has a leading seed axis but `step`."""
+
+    def __init__(self, agent: Agent, spec: Spec):
+        self.phases, self._agent, self._spec = agent.phases(), agent, spec
+        self._jitted_act = jax.jit(self._act)
+        self._jitted_learn = jax.jit(self._learn, static_argnames="index", donate_argnums=0)
+
+    def init(self, keys: Key, capacity: int) -> Learner:
+        """Fresh states and empty replays."""
+        states = jax.jit(jax.vmap(functools.partial(self._agent.init, self._spec)))(keys)
+        replay = jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), ring.init(self._spec, 1))
+        size = {
+            name: (len(keys), capacity, *leaf.shape[2:]) for name, leaf in replay._asdict().items() if leaf.ndim > 1
+        }
+        return Learner(states, replay._replace(**{n: jnp.zeros(s, getattr(replay, n).dtype) for n, s in size.items()}))
+
+    def act(self, agent: State, seen: Seen, keys: Key, step: int) -> Action:
+        """Exploring actions for all seeds, not waited for."""
+        return self._jitted_act(agent, seen, keys, np.int32(step))
+
+    def learn(
+        self,
+        learner: Learner,
+        transition: Transition,
+        hidden: NDArray[np.int32],
+        keys: Key,
+        step: int,
+        due: tuple[int, ...],
+    ) -> tuple[Learner, Metrics]:
+        """Store one step, and run the phases that are due; not waited for. The learner's old arrays are gone."""
+        metrics: Metrics = {}
+        new: Transition | None = transition
+        for index in due or (None,):  # the first call stores the step too: one call in an ordinary step
+            learner, more = self._jitted_learn(learner, new, hidden, keys, np.int32(step), index=index)
+            new, metrics = None, metrics | more
+        return learner, metrics
+
+    def due(self, step: int, schedule: Schedule) -> tuple[int, ...]:
+        """The phases that run once `step` steps are stored."""
+        if step <= schedule.random_steps:
+            return ()
+        return tuple(i for i, phase in enumerate(self.phases) if step % phase.every == 0)
+
+    def _act(self, agent: State, seen: Seen, keys: Key, step: Int[Array, ""]) -> Action:
+        def one(state: State, seen: Seen, key: Key) -> Action:
+            return self._agent.act(state, seen, jax.random.fold_in(key, step), explore=True)
+
+        return jax.vmap(one)(agent, seen, keys)
+
+    def _learn(
+        self,
+        learner: Learner,
+        transition: Transition | None,
+        hidden: Int[Array, " seeds"],
+        keys: Key,
+        step: Int[Array, ""],
+        index: int | None,
+    ) -> tuple[Learner, Metrics]:
+        agent, replay = learner
+        if transition is not None:
+            replay = jax.vmap(ring.append)(replay, transition)
+        if index is None:
+            return Learner(agent, replay), {}
+        phase = self.phases[index]
+        reach = (phase.batch, self._spec.delay, self._agent.ahead(self._spec))
+
+        def update(agent: State, i: Int[Array, ""]) -> tuple[State, Metrics]:
+            count = step // phase.every * phase.updates + i
+
+            def one(agent: State, replay: ring.Replay, key: Key, hidden: Int[Array, ""]) -> tuple[State, Metrics]:
+                for number in (step, index, i):
+                    key = jax.random.fold_in(key, number)
+                draw, learn = jax.random.split(key)
+                return phase.update(agent, ring.sample(replay, draw, *reach, hidden), learn, count)
+
+            return jax.vmap(one)(agent, replay, keys, hidden)
+
+        if phase.updates == 1:
+            agent, metrics = update(agent, jnp.int32(0))
+        else:
+            agent, metrics = jax.lax.scan(update, agent, jnp.arange(phase.updates))
+            metrics = jax.tree.map(lambda x: x.mean(0), metrics)
+        return Learner(agent, replay), metrics
+
+
+def estimate_seconds(
+    program: Program, learner: Learner, agent: Agent, spec: Spec, schedule: Schedule, step: int
+) -> float:
+    """A rough guess of the time to train: the updates' arithmetic, at a fraction of this device's matmul rate."""
+    square = jnp.ones((1024, 1024))
+    multiply = jax.jit(lambda x: x @ x)
+    multiply(square).block_until_ready()
+    start = time.perf_counter()
+    for _ in range(4):
+        multiply(square).block_until_ready()
+    rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
+    seconds = (schedule.steps - step) * 2e-4
+    replay = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.replay)
+    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.agent)
+    seeds = learner.replay.rows.shape[0]
+    for phase in program.phases:
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        number = jax.ShapeDtypeStruct((), jnp.int32)
+        reach = (phase.batch, spec.delay, agent.ahead(spec))
+        windows = jax.eval_shape(
+            lambda r, k, h, reach=reach: ring.sample(r, k, reach[0], reach[1], reach[2], h), replay, key, number
+        )
+        cost = jax.jit(phase.update).lower(state, windows, key, number).cost_analysis()
+        flops = float((cost or {}).get("flops", 0.0))
+        rounds = (schedule.steps - max(step, schedule.random_steps)) / phase.every
+        seconds += max(rounds, 0) * phase.updates * seeds * (flops / (UTILISATION * rate) + 3e-4)
+    return seconds
+
+
+UTILISATION = 0.25
+"""Share of the matmul rate that an update reaches on a CPU, measured on presets `small` and `paper`."""
