@@ -40,7 +40,7 @@ class Actor:
         if not (np.isfinite(reward) and np.isfinite(self.truth).all()):
             what = "reward" if not np.isfinite(reward) else "observation"
             raise DelayRLError(
-                f"the environment gave a {what} that is not finite in step {len(self.actions)} of episode {self.episode}"
+                f"the environment gave a {what} that is not finite: step {len(self.actions)}, episode {self.episode}"
             )
         done = terminated or truncated
         step = Transition(

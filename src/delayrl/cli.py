@@ -68,9 +68,7 @@ def _train(arguments: list[str]) -> None:
     name = arguments[0] if arguments and not arguments[0].startswith("-") else None
     if name is None:
         if {"-h", "--help"} & set(arguments):
-            print(
-                "usage: delayrl train AGENT --env ID --delay N [options]; `delayrl train AGENT --help` shows all of them\n"
-            )
+            print("usage: delayrl train AGENT --env ID --delay N [options]; `delayrl train AGENT --help` shows them\n")
             _agents(None)
             return
         raise DelayRLError("name the agent to train, e.g. `delayrl train vdpo`; `delayrl agents` lists them")

@@ -6,13 +6,14 @@ of an episode, so that a law is a value and an episode can be replayed from its 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from delayrl.errors import DelayRLError
 
 
+@runtime_checkable
 class DelayLaw(Protocol):
     """How long observations travel, in environment steps."""
 
@@ -54,7 +55,7 @@ def as_law(delay: int | DelayLaw) -> DelayLaw:
     Raises:
         DelayRLError: for a negative or fractional number, or anything that is no law.
     """
-    if hasattr(delay, "draw") and hasattr(delay, "maximum"):
+    if isinstance(delay, DelayLaw):
         return delay
     if isinstance(delay, float) and delay.is_integer():
         delay = int(delay)

@@ -1,10 +1,13 @@
 """Evaluation: deterministic actions, a start state of its own for every episode, one row per episode, never a mean."""
 
+import functools
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +17,7 @@ from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.policy import load
 from delayrl.runs import Run
-from delayrl.types import Key, Spec
+from delayrl.types import Action, Key, Seen, Spec
 from delayrl.views import seen_now
 
 
@@ -43,8 +46,7 @@ class Evaluator:
             raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {law.maximum}")
         self._delay = spec.delay
         self._envs = [[make(env, law, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
-        single = lambda state, seen, key: agent.act(state, seen, key, explore=False)  # noqa: E731
-        self._act = jax.jit(jax.vmap(jax.vmap(single, (None, 0, 0))))
+        self._act = _compiled_act(agent)
 
     def __call__(self, states: State, reset_seeds: Sequence[Sequence[int]], keys: Key) -> Episodes:
         """Play one episode from each reset seed, [seeds, episodes]."""
@@ -54,13 +56,10 @@ class Evaluator:
             [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
-        split = jax.jit(
-            jax.vmap(lambda key, step: jax.random.split(jax.random.fold_in(key, step), shape[1]), (0, None))
-        )
         step = 0
         while running.any():
-            batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *sum(seen, []))
-            actions = np.asarray(self._act(states, batch, split(keys, step)))
+            batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
+            actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
             step += 1
             for i, j in np.argwhere(running):
                 obs, reward, terminated, truncated, info = self._envs[i][j].step(actions[i, j])
@@ -74,6 +73,22 @@ class Evaluator:
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
         return seen_now(obs, info, self._delay, privileged=False)
+
+
+@functools.cache
+def _compiled_act(agent: Agent) -> Any:
+    """Deterministic actions for [seeds, episodes], each with a key of its own."""
+
+    def one(state: State, seen: Seen, key: Key, step: int, episode: int) -> Action:
+        for number in (step, episode):
+            key = jax.random.fold_in(key, number)
+        return agent.act(state, seen, key, explore=False)
+
+    def episodes(state: State, seen: Seen, key: Key, step: int) -> Action:
+        numbers = jnp.arange(seen.age.shape[0])
+        return jax.vmap(one, (None, 0, None, None, 0))(state, seen, key, step, numbers)
+
+    return jax.jit(jax.vmap(episodes, (0, 0, 0, None)))
 
 
 def reset_seed(seed: int, *stream: int) -> int:

@@ -23,7 +23,10 @@ class Learner(NamedTuple):
 
 
 class Program:
-    """The jitted functions of one agent on one task. Every argument has a leading seed axis but `step`."""
+    """The jitted functions of one agent on one task. Every argument has a leading seed axis but `step`.
+
+    Made by `compiled`, which gives the same agent on the same task the same functions again.
+    """
 
     def __init__(self, agent: Agent, spec: Spec):
         self.phases, self._agent, self._spec = agent.phases(), agent, spec
@@ -106,6 +109,9 @@ class Program:
             agent, metrics = jax.lax.scan(update, agent, jnp.arange(phase.updates))
             metrics = jax.tree.map(lambda x: x.mean(0), metrics)
         return Learner(agent, replay), metrics
+
+
+compiled = functools.cache(Program)
 
 
 def estimate_seconds(

@@ -1,12 +1,15 @@
 """Networks as pure functions on plain trees of arrays: `*_init(key, …) -> params`, then `network(params, x)`."""
 
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from delayrl.types import Action, Key
+from delayrl.types import Key
 
 Params = Any
 """A tree (dicts and lists) of arrays."""
@@ -21,15 +24,8 @@ class Gaussian(NamedTuple):
 
 
 def linear_init(key: Key, inputs: int, outputs: int, std: float | None = None) -> Params:
-    """PyTorch's default, uniform within 1/√inputs; or weights N(0, std²) and no bias."""
-    w, b = jax.random.split(key)
-    if std is not None:
-        return {"w": std * jax.random.normal(w, (inputs, outputs)), "b": jnp.zeros(outputs)}
-    bound = inputs**-0.5
-    return {
-        "w": jax.random.uniform(w, (inputs, outputs), minval=-bound, maxval=bound),
-        "b": jax.random.uniform(b, (outputs,), minval=-bound, maxval=bound),
-    }
+    """One layer of `mlp_init`."""
+    return mlp_init(key, (inputs, outputs), std)[0]
 
 
 def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
@@ -38,9 +34,27 @@ def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*b
 
 
 def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None) -> Params:
-    """Layers from sizes[0] inputs to sizes[-1] outputs."""
-    keys = jax.random.split(key, len(sizes) - 1)
-    return [linear_init(k, i, o, std) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=True)]
+    """Layers from sizes[0] inputs to sizes[-1] outputs.
+
+    PyTorch's default, weights and biases uniform within 1/√inputs; or weights N(0, std²) and no bias.
+    """
+    shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+    weights = cut(jax.random.normal if std else _uniform, key, [*shapes, *[(o,) for _, o in shapes]])
+    matrices, biases = weights[: len(shapes)], weights[len(shapes) :]
+    if std:
+        return [{"w": std * w, "b": jnp.zeros_like(b)} for w, b in zip(matrices, biases, strict=True)]
+    return [{"w": w * len(w) ** -0.5, "b": b * len(w) ** -0.5} for w, b in zip(matrices, biases, strict=True)]
+
+
+def cut(draw: Callable[..., Array], key: Key, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Random arrays of several shapes from one draw, which compiles several times faster than a draw for each."""
+    sizes = [math.prod(shape) for shape in shapes]
+    pieces = jnp.split(draw(key, (sum(sizes),)), list(itertools.accumulate(sizes))[:-1])
+    return [piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)]
+
+
+def _uniform(key: Key, shape: tuple[int, ...]) -> Array:
+    return jax.random.uniform(key, shape, minval=-1, maxval=1)
 
 
 def mlp(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
@@ -64,12 +78,12 @@ def gaussian(
     return Gaussian(mean, jnp.clip(log_std, low, high))
 
 
-def mode(policy: Gaussian) -> Action:
+def mode(policy: Gaussian) -> Float[Array, "*batch action"]:
     """The deterministic action, tanh(mean)."""
     return jnp.tanh(policy.mean)
 
 
-def sample(policy: Gaussian, key: Key) -> tuple[Action, Float[Array, "*batch"]]:
+def sample(policy: Gaussian, key: Key) -> tuple[Float[Array, "*batch action"], Float[Array, "*batch"]]:
     """An action in [-1, 1] and the log of its density there (SAC, Haarnoja et al. 2018, appendix C)."""
     noise = jax.random.normal(key, policy.mean.shape)
     raw = policy.mean + jnp.exp(policy.log_std) * noise
@@ -106,29 +120,35 @@ def dropout(key: Key | None, rate: float, x: Float[Array, "*shape"]) -> Float[Ar
 
 def transformer_init(key: Key, obs_size: int, action_size: int, length: int, width: int, layers: int) -> Params:
     """Weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform: as the released code of VDPO."""
-    keys = iter(jax.random.split(key, 4 + 4 * layers))
+    normal_key, uniform_key = jax.random.split(key)
+    square = (width, width)
+    shapes = [(obs_size, width), (action_size, width), (2 * width, width), (length, width), *[square] * (3 * layers)]
+    of_obs, of_action, join, position, *rest = (0.02 * w for w in cut(jax.random.normal, normal_key, shapes))
+    xavier = cut(_uniform, uniform_key, [(width, 3 * width)] * layers)
+
+    def biased(w: Array) -> Params:
+        return {"w": w, "b": jnp.zeros(w.shape[1])}
 
     def normed() -> Params:
         return {"scale": jnp.ones(width), "shift": jnp.zeros(width)}
 
-    def block() -> Params:
-        bound = (6 / (4 * width)) ** 0.5
-        qkv = jax.random.uniform(next(keys), (width, 3 * width), minval=-bound, maxval=bound)
-        return {
+    blocks = [
+        {
             "norm1": normed(),
-            "qkv": {"w": qkv, "b": jnp.zeros(3 * width)},
-            "out": linear_init(next(keys), width, width, 0.02),
+            "qkv": biased((6 / (4 * width)) ** 0.5 * qkv),
+            "out": biased(out),
             "norm2": normed(),
-            "mlp": [linear_init(next(keys), width, width, 0.02) for _ in range(2)],
+            "mlp": [biased(first), biased(second)],
         }
-
+        for qkv, out, first, second in zip(xavier, rest[::3], rest[1::3], rest[2::3], strict=True)
+    ]
     return {
-        "obs": linear_init(next(keys), obs_size, width, 0.02),
-        "action": linear_init(next(keys), action_size, width, 0.02),
-        "join": linear_init(next(keys), 2 * width, width, 0.02),
-        "position": 0.02 * jax.random.normal(next(keys), (length, width)),
+        "obs": biased(of_obs),
+        "action": biased(of_action),
+        "join": biased(join),
+        "position": position,
         "norm_in": normed(),
-        "blocks": [block() for _ in range(layers)],
+        "blocks": blocks,
         "norm_out": normed(),
     }
 

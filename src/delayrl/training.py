@@ -30,7 +30,7 @@ from delayrl.config import check_names, override, values_of
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, reset_seed
-from delayrl.learning import Program, estimate_seconds
+from delayrl.learning import compiled, estimate_seconds
 from delayrl.plots import curve
 from delayrl.policy import spec_of
 from delayrl.provenance import versions
@@ -123,7 +123,7 @@ class Session:
         if schedule.replay_capacity < least:
             raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
         self.template = template(agent, self.spec)  # says what does not fit, before anything is stored
-        self.program = Program(agent, self.spec)
+        self.program = compiled(agent, self.spec)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step = 0
         self.pending: Transition | None = None

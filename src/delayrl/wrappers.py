@@ -11,6 +11,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from delayrl.delays import DelayLaw, as_law
@@ -35,7 +36,7 @@ def check_spaces(env: gym.Env[Any, Any]) -> None:
         raise DelayRLError(f"{name}: actions must be bounded; got {actions}. Wrap it with RescaleAction or a clip")
 
 
-class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]):
+class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
     """Shows each observation only after its delay; rewards and terminations are not delayed.
 
     Added to `info`, with Δ the longest delay and A the size of an action:
@@ -54,7 +55,8 @@ class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], N
 
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]], delay: int | DelayLaw) -> None:
         check_spaces(env)
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, delay=delay)
+        gym.Wrapper.__init__(self, env)
         self.law = as_law(delay)
         limit = env.spec.max_episode_steps if env.spec is not None else None
         if limit is not None and self.law.maximum >= limit:
@@ -103,7 +105,7 @@ class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], N
         return shown, {**info, **late}
 
 
-class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]):
+class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
     """Flattens the augmented state into one Box, so that any library can train on a delayed task.
 
     The vector is the shown observation, the Δ actions since (oldest first, zeros where there are none yet) and the age
@@ -116,7 +118,8 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
     def __init__(self, env: DelayedObservation) -> None:
         if not isinstance(env, DelayedObservation):
             raise DelayRLError("AugmentedObservation goes around DelayedObservation: wrap the task with a delay first")
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
         self._delay = env.law.maximum
         observations, actions = env.observation_space, env.action_space
         assert isinstance(observations, Box)

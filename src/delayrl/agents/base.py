@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import optax
@@ -28,6 +28,7 @@ class Phase(NamedTuple):
     update: Callable[[State, Window, Key, Int[Array, ""]], tuple[State, Metrics]]
 
 
+@runtime_checkable
 class Agent(Protocol):
     """A frozen dataclass of hyperparameters with pure methods, written for one seed."""
 

@@ -1,7 +1,7 @@
 """Variational Delayed Policy Optimization (Wu et al., NeurIPS 2024), Algorithm 1.
 
-Idea: (A) learn a reference policy with SAC where there is no delay; (B) clone it into a delayed policy: a transformer on
-(last observation, actions since) whose belief head reconstructs the unseen states, and whose policy head is brought
+Idea: (A) learn a reference policy with SAC where there is no delay; (B) clone it into a delayed policy: a transformer
+on (last observation, actions since) whose belief head reconstructs the unseen states, and whose policy head is brought
 near the reference by KL. Position i of the transformer serves the delay i + 1, so one network serves every age 1..Δ;
 at age 0 the state is current and the reference itself acts.
 
@@ -11,7 +11,7 @@ Views: the reference sees s_t, the delayed policy x_t. While it trains, its beha
 Deviations from the paper and from the released code are numbered in docs/algorithms/vdpo.md.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -57,7 +57,7 @@ class Unseen(NamedTuple):
 class VDPO:
     """Hyperparameters; the defaults are the paper's (appendix) and, where it is silent, the released code's."""
 
-    reference: sac.SAC = sac.SAC()
+    reference: sac.SAC = field(default_factory=sac.SAC)
     representation: Annotated[Representation, "of x_t; the paper's ablation"] = "transformer"
     width: Annotated[int, "embedding dimension of the transformer, and width of the policy head"] = 256
     layers: Annotated[int, "blocks of the transformer"] = 3

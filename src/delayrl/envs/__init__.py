@@ -2,7 +2,6 @@
 
 import contextlib
 import difflib
-import io
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,23 +12,12 @@ import numpy as np
 from gymnasium.wrappers import RescaleAction
 
 from delayrl.delays import DelayLaw
-from delayrl.envs import probe
+from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError
 from delayrl.wrappers import DelayedObservation, check_spaces
 
 probe.register()
-
-PAPER_TASKS = (
-    "Ant",
-    "HalfCheetah",
-    "Hopper",
-    "Humanoid",
-    "HumanoidStandup",
-    "Pusher",
-    "Reacher",
-    "Swimmer",
-    "Walker2d",
-)
+paper.register()
 
 
 def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **options: Any) -> DelayedObservation:
@@ -45,9 +33,7 @@ def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **option
         DelayRLError: unknown task (with the nearest names), unsuitable spaces, bad delay.
     """
     try:
-        # MuJoCo and Gymnasium print notes on deprecated versions that are no business of the user's
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
+        with quiet():
             task = gym.make(env, disable_env_checker=True, **options)
     except Exception as error:  # a task's own constructor may raise anything
         if env in gym.registry:
@@ -59,6 +45,20 @@ def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **option
     if rescale:
         task = RescaleAction(task, np.float32(-1), np.float32(1))
     return DelayedObservation(task, delay)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without notes on deprecated models and versions: MuJoCo would print them and start a log file where we run."""
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def tasks() -> Iterator[Task]:
     """The paper's nine tasks, the small ones to try things on, and the probes of the tests."""
     small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
     ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
-    for name in [f"{task}-v5" for task in PAPER_TASKS] + small + ours:
+    for name in [f"{task}-v5" for task in paper.TASKS] + small + ours:
         env = make(name)
         spaces = (env.observation_space.shape, env.action_space.shape)
         limit = env.spec.max_episode_steps if env.spec else None

@@ -12,7 +12,7 @@ _STEP = tuple[Obs, float, bool, bool, dict[str, Any]]
 
 
 class Coin(gym.Env[Obs, Obs]):
-    """The state is a fresh fair coin ±1 at every step; reward a·s: with a delay of 1 or more nobody averages above 0."""
+    """The state is a fresh fair coin ±1 at every step, the reward a·s: under delay nobody averages above 0."""
 
     observation_space = Box(-1, 1, (1,), np.float32)
     action_space = Box(-1, 1, (1,), np.float32)

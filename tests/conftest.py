@@ -1,0 +1,40 @@
+"""Shapes in annotations are checked while the tests run; nothing else is switched on."""
+
+from jaxtyping import install_import_hook
+
+install_import_hook(
+    ["delayrl.networks", "delayrl.objectives", "delayrl.views", "delayrl.replay", "delayrl.agents"], "beartype.beartype"
+)
+
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+
+from delayrl.acting import Actor  # noqa: E402
+from delayrl.agents.sac import SAC  # noqa: E402
+from delayrl.agents.vdpo import VDPO  # noqa: E402
+from delayrl.envs import make  # noqa: E402
+
+TINY_SAC = SAC(hidden=(16, 16), batch_size=16)
+TINY = {
+    "sac-memoryless": SAC(actor_sees="delayed", critic_sees="delayed", hidden=(16, 16), batch_size=16),
+    "a-sac": SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16),
+    "bpql": SAC(actor_sees="augmented", critic_sees="current", hidden=(16, 16), batch_size=16),
+    "vdpo": VDPO(TINY_SAC, width=8, layers=2, clone_every=10, clone_updates=3),
+}
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def record(env: str, delay: int, steps: int, seed: int = 0) -> tuple[list, list]:
+    """Random play: every transition, and what the wrapper showed before each of its actions."""
+    rng = np.random.default_rng(seed)
+    actor = Actor(make(env, delay, rescale=True), seed, privileged=False)
+    actor.reset()
+    transitions, shown = [], []
+    for _ in range(steps):
+        shown.append(actor.seen)
+        transitions.append(actor.step(rng.uniform(-1, 1, actor.env.action_space.shape).astype(np.float32)))
+    return transitions, shown

@@ -1,0 +1,119 @@
+"""The delay is what it says, from the first step on, and needs no JAX."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import delayrl
+from delayrl.delays import Constant
+from delayrl.wrappers import AugmentedObservation, DelayedObservation
+
+
+def rollout(env: gym.Env, steps: int, seed: int = 0) -> tuple[list, list, list]:
+    env.action_space.seed(1)
+    obs, info = env.reset(seed=seed)
+    observations, infos, actions = [obs], [info], []
+    for _ in range(steps):
+        actions.append(env.action_space.sample())
+        obs, _, terminated, truncated, info = env.step(actions[-1])
+        observations.append(obs)
+        infos.append(info)
+        if terminated or truncated:
+            break
+    return observations, infos, actions
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3, 7])
+@pytest.mark.parametrize("task", ["Reacher-v5", "Hopper-v5", "Pendulum-v1"])
+def test_shift(task: str, delay: int) -> None:
+    """At step t the agent sees s_{t-d}, d = min(t, Δ), and the d actions since."""
+    true, _, _ = rollout(gym.make(task), 30)
+    seen, infos, actions = rollout(delayrl.make(task, delay), 30)
+    assert len(seen) > 8
+    for t, (obs, info) in enumerate(zip(seen, infos, strict=True)):
+        age = min(t, delay)
+        assert info["age"] == age
+        np.testing.assert_array_equal(obs, true[t - age])
+        np.testing.assert_array_equal(info["truth"], true[t])
+        np.testing.assert_array_equal(info["actions"][:age], actions[t - age : t] or info["actions"][:0])
+        assert not info["actions"][age:].any()
+        assert info["mask"].tolist() == [True] * age + [False] * (delay - age)
+
+
+def test_reset_forgets() -> None:
+    """A second episode is as the first: nothing of the old one is shown, nothing is pushed twice."""
+    env = delayrl.make("Reacher-v5", 3)
+    first, infos, _ = rollout(env, 20, seed=4)
+    again, infos_again, _ = rollout(env, 20, seed=4)
+    np.testing.assert_array_equal(first, again)
+    assert [i["age"] for i in infos] == [i["age"] for i in infos_again] == [0, 1, 2] + [3] * 18
+
+
+def test_augmented_is_flat() -> None:
+    plain = delayrl.make("Pusher-v5", 4)
+    env = AugmentedObservation(delayrl.make("Pusher-v5", 4))
+    seen, infos, _ = rollout(plain, 10)
+    flat, _, _ = rollout(env, 10)
+    assert env.observation_space.shape == (23 + 4 * 7 + 1,)
+    for obs, info, x in zip(seen, infos, flat, strict=True):
+        np.testing.assert_allclose(x, np.concatenate([obs, info["actions"].ravel(), [info["age"] / 4]]))
+        assert env.observation_space.contains(x)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("augmented", [False, True])
+def test_gymnasium_checker(augmented: bool) -> None:
+    env = delayrl.make("Reacher-v5", 3)
+    check_env(AugmentedObservation(env) if augmented else env, skip_render_check=True)
+
+
+def test_needs_no_jax() -> None:
+    code = "import sys, delayrl, delayrl.wrappers; delayrl.make('Pendulum-v1', 2); sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("delay", "words"),
+    [(-1, "negative"), (2.5, "whole"), ("5", "whole"), (True, "whole"), (50, "no shorter than an episode")],
+)
+def test_bad_delays(delay: object, words: str) -> None:
+    with pytest.raises(delayrl.DelayRLError, match=words):
+        delayrl.make("Reacher-v5", delay)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ("CartPole-v1", "continuous"),
+        ("FrozenLake-v1", "must be a Box"),
+        ("Invertedpendulum-v5", "did you mean InvertedPendulum-v5"),
+        ("nonsense", "delayrl tasks"),
+    ],
+)
+def test_bad_tasks(task: str, words: str) -> None:
+    with pytest.raises(delayrl.DelayRLError, match=words):
+        delayrl.make(task, 1)
+
+
+def test_images_and_unbounded_actions() -> None:
+    class Images(gym.Env):
+        observation_space = gym.spaces.Box(0, 1, (3, 3))
+        action_space = gym.spaces.Box(-1, 1, (1,))
+
+    class Unbounded(gym.Env):
+        observation_space = gym.spaces.Box(-1, 1, (3,))
+        action_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+
+    with pytest.raises(delayrl.DelayRLError, match="images"):
+        DelayedObservation(Images(), 1)
+    with pytest.raises(delayrl.DelayRLError, match="bounded"):
+        DelayedObservation(Unbounded(), 1)
+
+
+def test_laws_are_values() -> None:
+    assert Constant(3) == Constant(3)
+    assert delayrl.make("Reacher-v5", Constant(3)).law == Constant(3)
