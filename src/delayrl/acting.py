@@ -38,9 +38,9 @@ class Actor:
         self._see(obs, info)
         reward = float(reward)
         if not (np.isfinite(reward) and np.isfinite(self.truth).all()):
-            what = "reward" if not np.isfinite(reward) else "observation"
+            what = "a reward" if not np.isfinite(reward) else "an observation"
             raise DelayRLError(
-                f"the environment gave a {what} that is not finite: step {len(self.actions)}, episode {self.episode}"
+                f"the environment gave {what} that is not finite: step {len(self.actions)}, episode {self.episode}"
             )
         done = terminated or truncated
         step = Transition(

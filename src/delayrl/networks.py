@@ -38,7 +38,7 @@ def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None) -> Para
 
     PyTorch's default, weights and biases uniform within 1/√inputs; or weights N(0, std²) and no bias.
     """
-    shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+    shapes = list(itertools.pairwise(sizes))
     weights = cut(jax.random.normal if std else _uniform, key, [*shapes, *[(o,) for _, o in shapes]])
     matrices, biases = weights[: len(shapes)], weights[len(shapes) :]
     if std:

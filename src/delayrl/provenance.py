@@ -2,10 +2,29 @@
 
 import os
 import platform
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import jax
+
+
+def commit() -> str | None:
+    """The commit of the checkout that the package lies in, marked where it has been changed; None outside of one."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short=12", "HEAD") + (
+            "-changed" if git("status", "--porcelain", "--", str(here)) else ""
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
 
 
 def versions() -> dict[str, Any]:
@@ -16,6 +35,7 @@ def versions() -> dict[str, Any]:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = None
+    found["commit"] = commit()
     found["device"] = jax.devices()[0].device_kind
     found["cores"] = os.cpu_count()
     found["machine"] = f"{platform.system()} {platform.machine()}"

@@ -1,0 +1,37 @@
+"""Collect runs into one file of rows that can be committed: `python benchmarks/collect.py OUT.jsonl RUN [RUN …]`.
+
+Each run is a line with its configuration and versions, then a line for each of its evaluation episodes; with
+--episodes N also N episodes on start states that the run never saw (`delayrl evaluate`). Nothing is written by hand.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from delayrl.evaluation import evaluate
+from delayrl.runs import Run
+
+KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
+
+
+def main() -> None:
+    """Read run folders, write rows."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--episodes", type=int, default=0, help="also evaluate each run on so many unseen start states")
+    given = parser.parse_args()
+    with open(given.out, "w") as file:
+        for number, path in enumerate(given.runs):
+            run = Run(path)
+            metrics = run.read("metrics")
+            speed = metrics[-1]["steps_per_second"] if metrics else None
+            print(json.dumps({"run": number, "config": run.config, "steps_per_second": speed}), file=file)
+            for row in run.read("rows"):
+                print(json.dumps({"run": number} | {name: row[name] for name in KEPT}), file=file)
+            if given.episodes:
+                print(json.dumps({"run": number, "evaluation": evaluate(path, given.episodes)}), file=file)
+
+
+if __name__ == "__main__":
+    main()
