@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State
@@ -79,12 +80,12 @@ class Evaluator:
 def _compiled_act(agent: Agent) -> Any:
     """Deterministic actions for [seeds, episodes], each with a key of its own."""
 
-    def one(state: State, seen: Seen, key: Key, step: int, episode: int) -> Action:
+    def one(state: State, seen: Seen, key: Key, step: Array, episode: Array) -> Action:
         for number in (step, episode):
             key = jax.random.fold_in(key, number)
         return agent.act(state, seen, key, explore=False)
 
-    def episodes(state: State, seen: Seen, key: Key, step: int) -> Action:
+    def episodes(state: State, seen: Seen, key: Key, step: Array) -> Action:
         numbers = jnp.arange(seen.age.shape[0])
         return jax.vmap(one, (None, 0, None, None, 0))(state, seen, key, step, numbers)
 

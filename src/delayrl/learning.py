@@ -1,7 +1,6 @@
 """The device's side: agent states and replays of all seeds, and the jitted functions on them."""
 
 import functools
-import time
 from typing import NamedTuple
 
 import jax
@@ -112,36 +111,3 @@ class Program:
 
 
 compiled = functools.cache(Program)
-
-
-def estimate_seconds(
-    program: Program, learner: Learner, agent: Agent, spec: Spec, schedule: Schedule, step: int
-) -> float:
-    """A rough guess of the time to train: the updates' arithmetic, at a fraction of this device's matmul rate."""
-    square = jnp.ones((1024, 1024))
-    multiply = jax.jit(lambda x: x @ x)
-    multiply(square).block_until_ready()
-    start = time.perf_counter()
-    for _ in range(4):
-        multiply(square).block_until_ready()
-    rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
-    seconds = (schedule.steps - step) * 2e-4
-    replay = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.replay)
-    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.agent)
-    seeds = learner.replay.rows.shape[0]
-    for phase in program.phases:
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        number = jax.ShapeDtypeStruct((), jnp.int32)
-        reach = (phase.batch, spec.delay, agent.ahead(spec))
-        windows = jax.eval_shape(
-            lambda r, k, h, reach=reach: ring.sample(r, k, reach[0], reach[1], reach[2], h), replay, key, number
-        )
-        cost = jax.jit(phase.update).lower(state, windows, key, number).cost_analysis()
-        flops = float((cost or {}).get("flops", 0.0))
-        rounds = (schedule.steps - max(step, schedule.random_steps)) / phase.every
-        seconds += max(rounds, 0) * phase.updates * seeds * (flops / (UTILISATION * rate) + 3e-4)
-    return seconds
-
-
-UTILISATION = 0.25
-"""Share of the matmul rate that an update reaches on a CPU, measured on presets `small` and `paper`."""

@@ -32,6 +32,10 @@ class Phase(NamedTuple):
 class Agent(Protocol):
     """A frozen dataclass of hyperparameters with pure methods, written for one seed."""
 
+    def __hash__(self) -> int:
+        """Equal hyperparameters share what is compiled."""
+        ...
+
     @property
     def privileged(self) -> bool:
         """Whether its behaviour reads the true current state while it trains."""

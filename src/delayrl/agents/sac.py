@@ -14,6 +14,7 @@ the critic sees decides how large the space is in which values are learned.
 Deviations are numbered in docs/algorithms/sac.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -116,79 +117,92 @@ class SAC:
         policy = self.policy(state.actor, network_input(seen, self.actor_sees))
         return networks.sample(policy, key)[0] if explore else networks.mode(policy)
 
-    def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """One critic update; every `actor_every`-th time the actor and the temperature, on the same batch."""
+    def update(
+        self,
+        state: State,
+        windows: Window,
+        key: Key,
+        count: Int[Array, ""],
+        penalty: Callable[[Gaussian], Array] | None = None,
+    ) -> tuple[State, Metrics]:
+        """One critic update; every `actor_every`-th time the actor and the temperature, on the same batch.
+
+        `penalty` is added to the actor's loss: a function of its policy at the batch, for agents built on this one.
+        """
         target_key, actor_key = jax.random.split(key)
         actor_now, critic_now = self._inputs(windows, 0)
         actor_next, critic_next = self._inputs(windows, windows.steps)
-        now, last = windows.delay, windows.delay + windows.steps - 1
 
         temperature = jnp.exp(state.log_temperature)
         action, log_prob = networks.sample(self.policy(state.actor, actor_next), target_key)
+        next_value = soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature)
+        state, metrics = self.learn_critic(state, windows, critic_now, next_value)
+
+        def improve(state: State) -> State:
+            for update_key in jax.random.split(actor_key, self.actor_updates):
+                draw, redraw = jax.random.split(update_key)
+                state = self.improve_actor(state, actor_now, critic_now, draw, penalty)
+                state = self.adjust_temperature(state, actor_now, redraw)
+            return state
+
+        state = jax.lax.cond(count % self.actor_every == self.actor_every - 1, improve, lambda state: state, state)
+        return state, metrics | {"entropy": -log_prob.mean(), "temperature": temperature}
+
+    def learn_critic(
+        self, state: State, windows: Window, critic_input: Array, next_value: Float[Array, " batch"]
+    ) -> tuple[State, Metrics]:
+        """One step of both critics towards the soft k-step target, given V(s_{t+k}); and of their targets."""
+        now, last = windows.delay, windows.delay + windows.steps - 1
         y = soft_target(
             k_step_return(windows.reward[:, now:], self.discount, windows.steps),
             self.discount**windows.steps,
             jnp.take_along_axis(windows.terminated, last[:, None], 1)[:, 0],
-            soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature),
+            next_value,
         )
         critic, critic_memory, loss, q = descend(
             optax.adam(self.critic_learning_rate),
             critic_loss,
             state.critic,
             state.critic_memory,
-            critic_now,
+            critic_input,
             windows.action[:, now],
             y,
         )
-        state = state._replace(critic=critic, critic_memory=critic_memory)
-        state = jax.lax.cond(
-            count % self.actor_every == self.actor_every - 1,
-            lambda state: self._improve(state, actor_now, critic_now, actor_key),
-            lambda state: state,
-            state,
-        )
-        target = optax.incremental_update(state.critic, state.target, self.target_rate)
-        metrics = {"critic_loss": loss, "q": q, "entropy": -log_prob.mean(), "temperature": temperature}
-        return state._replace(target=target), metrics
+        target = optax.incremental_update(critic, state.target, self.target_rate)
+        state = state._replace(critic=critic, critic_memory=critic_memory, target=target)
+        return state, {"critic_loss": loss, "q": q}
 
-    def _improve(self, state: State, actor_input: Array, critic_input: Array, key: Key) -> State:
-        """Rounds of policy improvement and of temperature adjustment."""
-        target_entropy = self.entropy_per_action * state.actor[-1]["b"].shape[-1] / 2
+    def improve_actor(
+        self,
+        state: State,
+        actor_input: Array,
+        critic_input: Array,
+        key: Key,
+        penalty: Callable[[Gaussian], Array] | None = None,
+    ) -> State:
+        """One step of the actor towards higher soft values (VDPO eq. max_pi)."""
+        temperature = jnp.exp(state.log_temperature)
 
-        def actor_loss(actor: Params, temperature: Array, key: Key) -> tuple[Array, Array]:
-            action, log_prob = networks.sample(self.policy(actor, actor_input), key)
+        def loss(actor: Params) -> tuple[Array, None]:
+            policy = self.policy(actor, actor_input)
+            action, log_prob = networks.sample(policy, key)
             value = soft_value(networks.twin(state.critic, critic_input, action), log_prob, temperature)
-            return -value.mean(), log_prob
+            return -value.mean() + (penalty(policy) if penalty else 0.0), None
 
-        for update_key in jax.random.split(key, self.actor_updates):
-            draw, redraw = jax.random.split(update_key)
-            temperature = jnp.exp(state.log_temperature)
-            actor, actor_memory, _, _ = descend(
-                optax.adam(self.actor_learning_rate),
-                actor_loss,
-                state.actor,
-                state.actor_memory,
-                temperature,
-                draw,
-            )
-            _, log_prob = networks.sample(self.policy(actor, actor_input), redraw)
-            log_temperature, temperature_memory, _, _ = descend(
-                optax.adam(self.temperature_learning_rate),
-                lambda log_temperature, log_prob: (
-                    temperature_loss(log_temperature, log_prob, target_entropy),
-                    None,
-                ),
-                state.log_temperature,
-                state.temperature_memory,
-                log_prob,
-            )
-            state = state._replace(
-                actor=actor,
-                actor_memory=actor_memory,
-                log_temperature=log_temperature,
-                temperature_memory=temperature_memory,
-            )
-        return state
+        actor, actor_memory, _, _ = descend(optax.adam(self.actor_learning_rate), loss, state.actor, state.actor_memory)
+        return state._replace(actor=actor, actor_memory=actor_memory)
+
+    def adjust_temperature(self, state: State, actor_input: Array, key: Key) -> State:
+        """One step of the temperature towards the target entropy, on a sample of its own."""
+        target_entropy = self.entropy_per_action * state.actor[-1]["b"].shape[-1] / 2
+        _, log_prob = networks.sample(self.policy(state.actor, actor_input), key)
+        log_temperature, temperature_memory, _, _ = descend(
+            optax.adam(self.temperature_learning_rate),
+            lambda log_temperature: (temperature_loss(log_temperature, log_prob, target_entropy), None),
+            state.log_temperature,
+            state.temperature_memory,
+        )
+        return state._replace(log_temperature=log_temperature, temperature_memory=temperature_memory)
 
     def _inputs(self, windows: Window, ahead: int | Array) -> tuple[Array, Array]:
         """What actor and critic see `ahead` steps after t, for each window."""

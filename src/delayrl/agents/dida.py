@@ -1,0 +1,137 @@
+"""Delayed imitation with dataset aggregation, DIDA (Liotet, Maran, Bisi, Restelli, ICML 2022).
+
+Idea: an expert learns where there is no delay, and is then frozen. A student that sees the augmented state imitates it
+(DAgger, Ross et al. 2011): first the expert acts, then the student, round after round; and in every state that was
+visited, whoever went there, the label is what the expert would have done in the true state.
+
+Views: the expert sees s_t, the student x_t. Privileged: the expert acts on the true state in the first part of the run.
+(Labels need no privilege: by the time that a step is learned from, its state has arrived.)
+
+There is one budget of environment steps, and the expert's are counted: it learns and acts up to step `expert_steps`.
+Deviations from the paper and from the released code are numbered in docs/algorithms/dida.md.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from delayrl import networks
+from delayrl.agents import sac
+from delayrl.agents.base import Agent, Phase, descend
+from delayrl.errors import DelayRLError
+from delayrl.networks import Params
+from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.views import input_size, look, network_input
+
+
+class State(NamedTuple):
+    """The expert, the student with what its optimiser remembers, and how far the run is."""
+
+    reference: sac.State
+    student: Params
+    memory: optax.OptState
+    steps: Int[Array, ""]  # environment steps that have been learned from: who acts depends on it
+
+
+@dataclass(frozen=True)
+class DIDA:
+    """Hyperparameters; the student's defaults are the released code's, the expert's are VDPO's reference's."""
+
+    reference: sac.SAC = field(default_factory=sac.SAC)
+    expert_steps: Annotated[int, "environment steps in which the expert learns and acts; whole rounds"] = 500_000
+    round_steps: Annotated[int, "environment steps in a round of aggregation, the student acting"] = 1000
+    imitation_updates: Annotated[int, "updates after each round, on fresh batches of all the data"] = 1000
+    student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)
+    student_learning_rate: Annotated[float, "RMSprop's step size"] = 1e-3
+    student_decay: Annotated[float, "RMSprop's memory of squared gradients"] = 0.9
+    student_batch_size: Annotated[int, "windows in a batch of imitation"] = 32
+
+    privileged = True
+
+    def ahead(self, spec: Spec) -> int:
+        """The expert's targets; imitation needs none."""
+        return self.reference.ahead(spec)
+
+    def phases(self) -> tuple[Phase, ...]:
+        """The expert at every step; imitation at the end of every round."""
+        return (
+            Phase(1, 1, self.reference.batch_size, self.update),
+            Phase(self.round_steps, self.imitation_updates, self.student_batch_size, self.imitate),
+        )
+
+    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
+        """The expert."""
+        return self.reference, state.reference
+
+    def init(self, spec: Spec, key: Key) -> State:
+        """Fresh networks."""
+        if spec.delay < 1:
+            raise DelayRLError("dida learns a policy for a delay of at least 1 step: give --delay N, or train sac")
+        if self.expert_steps % self.round_steps:
+            raise DelayRLError(
+                f"expert_steps must be whole rounds of {self.round_steps} steps; got {self.expert_steps}"
+            )
+        reference_key, student_key = jax.random.split(key)
+        sizes = (input_size(spec, "augmented"), *self.student_hidden, spec.action_size)
+        student = networks.mlp_init(student_key, sizes)
+        reference = self.reference.init(replace(spec, delay=0), reference_key)
+        return State(reference, student, self.optimiser.init(student), jnp.zeros((), jnp.int32))
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """RMSprop as in PyTorch: ε outside of the root."""
+        return optax.rmsprop(self.student_learning_rate, self.student_decay, eps=1e-10, eps_in_sqrt=False)
+
+    def policy(self, student: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch action"]:
+        """The student's action at inputs `x`: it is deterministic."""
+        return jnp.tanh(networks.mlp(student, x))
+
+    def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
+        """The student; but in the first part of training the expert, exploring as SAC does."""
+        student = self.policy(state.student, network_input(seen, "augmented"))
+        if not explore:
+            return student
+        assert seen.truth is not None, "behaviour with the expert is privileged"
+        expert = self.reference.act(state.reference, seen._replace(obs=seen.truth), key, explore=True)
+        return jnp.where(state.steps < self.expert_steps, expert, student)
+
+    def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
+        """SAC's update of the expert, up to `expert_steps`; `count` is the environment step, the same for all seeds."""
+
+        def learn(reference: sac.State) -> tuple[sac.State, Metrics]:
+            return self.reference.update(reference, windows, key, count)
+
+        _, metrics = jax.eval_shape(learn, state.reference)
+        idle = {name: jnp.zeros(metric.shape, metric.dtype) for name, metric in metrics.items()}
+        reference, metrics = jax.lax.cond(
+            count <= self.expert_steps, learn, lambda reference: (reference, idle), state.reference
+        )
+        return state._replace(reference=reference, steps=jnp.asarray(count, jnp.int32)), metrics
+
+    def imitate(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
+        """One update of the student, once the expert has finished: for the first time before the student acts."""
+
+        def learn(student: Params, memory: optax.OptState) -> tuple[Params, optax.OptState, Array]:
+            student, memory, loss, _ = descend(
+                self.optimiser, self.imitation_loss, student, memory, state.reference.actor, windows
+            )
+            return student, memory, loss
+
+        student, memory, loss = jax.lax.cond(
+            count // self.imitation_updates * self.round_steps >= self.expert_steps,
+            learn,
+            lambda student, memory: (student, memory, jnp.zeros(())),
+            state.student,
+            state.memory,
+        )
+        return state._replace(student=student, memory=memory), {"imitation_loss": loss}
+
+    def imitation_loss(self, student: Params, expert: Params, windows: Window) -> tuple[Array, None]:
+        """Σ |a_student(x_t) - a_expert(s_t)| over batch and dimensions; the expert's action is its mode."""
+        x, s = (jax.vmap(lambda window, sees=sees: look(window, sees))(windows) for sees in ("augmented", "current"))
+        label = jax.lax.stop_gradient(networks.mode(self.reference.policy(expert, s)))
+        return jnp.abs(self.policy(student, x) - label).sum(), None

@@ -1,0 +1,250 @@
+"""AD-SAC: what is seen, the target, the coin, the behaviour, and that it is A-SAC where the delays are equal."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from conftest import record
+from delayrl import networks
+from delayrl import replay as ring
+from delayrl.agents.adsac import ADSAC, State
+from delayrl.agents.sac import SAC
+from delayrl.errors import DelayRLError
+from delayrl.learning import Program
+from delayrl.types import Seen, Spec, Transition, Window
+
+ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
+SPEC = Spec(OBS, ACT, DELAY)
+TINY = SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16)
+
+
+def same(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+@functools.cache
+def windows_of(env: str = ENV, spec: Spec = SPEC, batch: int = 16) -> Window:
+    replay = ring.init(spec, 300)
+    append = jax.jit(ring.append)
+    for transition in record(env, spec.delay, 150)[0]:
+        replay = append(replay, transition)
+    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+    return sample(replay, jax.random.key(0), batch, spec.delay, 3, jnp.int32(0))
+
+
+@functools.cache
+def started(auxiliary_delay: int = 0, **options) -> tuple[ADSAC, State]:
+    agent = ADSAC(dataclasses.replace(TINY, **options), auxiliary_delay)
+    state = agent.init(SPEC, jax.random.key(0))
+    # temperatures that differ, so that taking one for the other shows
+    auxiliary = state.auxiliary._replace(log_temperature=jnp.float32(np.log(0.5)))
+    return agent, state._replace(auxiliary=auxiliary, log_temperature=jnp.float32(np.log(0.2)))
+
+
+@pytest.mark.parametrize("auxiliary_delay", [0, 2, 4])
+def test_inputs_are_aligned(auxiliary_delay: int) -> None:
+    """On a counter: x_t of the delay 4, and x^τ_t of the shorter one, of the same true step."""
+    transitions, _ = record("delayrl/Counter-v0", 4, 150)
+    windows = windows_of("delayrl/Counter-v0", Spec(2, 1, 4), 300)
+    agent = ADSAC(auxiliary_delay=auxiliary_delay)
+    by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
+    for ahead in (0, windows.steps):
+        inputs = agent.inputs(windows, ahead)
+        for i in range(0, 300, 3):
+            step = by_action[float(windows.action[i, 4, 0])]
+            now, length = transitions[step].obs
+            k = int(np.broadcast_to(ahead, 300)[i])
+            for x, delay in ((inputs.auxiliary, auxiliary_delay), (inputs.augmented, 4)):
+                age = min(int(now) + k, delay)
+                since = [transitions[step + k - age + j].action[0] if j < age else 0 for j in range(delay)]
+                tail = [*since, age / delay] if delay else []
+                np.testing.assert_allclose(x[i], [now + k - age, length, *tail], rtol=1e-6)
+
+
+def test_next_value_by_hand() -> None:
+    """min(3 - 0.5 log π_τ, 5 - 0.2 log π): target critics that give 3 and 5 everywhere."""
+    agent, state = started()
+    constant = [jax.tree.map(jnp.zeros_like, critic) for critic in state.auxiliary.target]
+    for critic, value in zip(constant, (3.0, 5.0), strict=True):
+        critic[-1]["b"] += value
+    state = state._replace(auxiliary=state.auxiliary._replace(target=constant))
+    later = agent.inputs(windows_of(), windows_of().steps)
+    auxiliary_key, augmented_key = jax.random.split(jax.random.key(3))
+    value, entropies = agent.next_value(state, later, auxiliary_key, augmented_key)
+    short = networks.sample(TINY.policy(state.auxiliary.actor, later.auxiliary), auxiliary_key)[1]
+    long = networks.sample(TINY.policy(state.actor, later.augmented), augmented_key)[1]
+    pair = np.stack([3 - 0.5 * np.asarray(short), 5 - 0.2 * np.asarray(long)])
+    np.testing.assert_allclose(value, pair.min(0), rtol=1e-5)
+    np.testing.assert_allclose(entropies["auxiliary_entropy"], -np.mean(short), rtol=1e-5)
+    np.testing.assert_allclose(entropies["entropy"], -np.mean(long), rtol=1e-5)
+
+
+def test_each_actor_has_its_target_critic() -> None:
+    """Swapping the target critics changes the value; so does each actor's temperature where its term is lower."""
+    agent, state = started()
+    later = agent.inputs(windows_of(), windows_of().steps)
+    keys = jax.random.split(jax.random.key(3))
+    value, _ = agent.next_value(state, later, *keys)
+    swapped = state.auxiliary._replace(target=state.auxiliary.target[::-1])
+    assert not np.allclose(value, agent.next_value(state._replace(auxiliary=swapped), later, *keys)[0])
+
+
+def test_critic_loss_by_hand() -> None:
+    """Y = Σ γ^j r + γ^k (1 - terminated) V, and the critics, at (x^τ, a), are compared with it."""
+    agent, state = started()
+    windows = windows_of()
+    key = jax.random.key(5)
+    auxiliary_key, augmented_key, _ = jax.random.split(key, 3)
+    value, _ = agent.next_value(state, agent.inputs(windows, windows.steps), auxiliary_key, augmented_key)
+    y = []
+    for i in range(16):
+        k = int(windows.steps[i])
+        rewards = np.asarray(windows.reward[i, DELAY : DELAY + k], np.float64)
+        ended = bool(windows.terminated[i, DELAY + k - 1])
+        y.append(sum(0.99**j * r for j, r in enumerate(rewards)) + 0.99**k * (1 - ended) * float(value[i]))
+    q = networks.twin(state.auxiliary.critic, windows.obs[:, DELAY], windows.action[:, DELAY])
+    _, metrics = agent.update(state, windows, key, jnp.int32(0))
+    np.testing.assert_allclose(metrics["critic_loss"], ((np.asarray(q) - y) ** 2).mean(1).sum(), rtol=1e-4)
+    np.testing.assert_allclose(metrics["q"], q.mean(), rtol=1e-4)
+
+
+def test_equal_delays_are_a_sac() -> None:
+    """τ = Δ, one set of parameters, one noise: target, critics, either actor's update are A-SAC's, bit for bit."""
+    agent, _ = started(DELAY, actor_updates=1)
+    windows, key = windows_of(), jax.random.key(7)
+    one = agent.learner.init(SPEC, jax.random.key(1))
+    state = State(one, one.actor, one.log_temperature, one.actor_memory, one.temperature_memory)
+    expected, metrics = agent.learner.update(one, windows, key, jnp.int32(1))
+
+    target_key, actor_key = jax.random.split(key)
+    draw, redraw = jax.random.split(jax.random.split(actor_key, 1)[0])
+    now, later = agent.inputs(windows, 0), agent.inputs(windows, windows.steps)
+    value, entropies = agent.next_value(state, later, target_key, target_key)
+    auxiliary, of_critic = agent.learner.learn_critic(state.auxiliary, windows, now.auxiliary, value)
+    state = state._replace(auxiliary=auxiliary)
+    assert same((of_critic["critic_loss"], entropies["entropy"]), (metrics["critic_loss"], metrics["entropy"]))
+    assert same((auxiliary.critic, auxiliary.target), (expected.critic, expected.target))
+
+    short = agent.improve_auxiliary(state, now, draw)
+    assert same(short._replace(auxiliary=auxiliary), state)
+    assert same(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, redraw), expected)
+    long = agent.improve_augmented(state, now, draw)
+    assert same(long.auxiliary, auxiliary)
+    assert same(long.actor, expected.actor)
+    assert same(long.actor_memory, expected.actor_memory)
+
+
+def test_a_coin_says_which_actor_learns() -> None:
+    """On odd counts one actor for each round, either one about as often; both temperatures; on even counts neither."""
+    agent, state = started(actor_updates=1)
+    update = jax.jit(agent.update)
+    windows = windows_of()
+    took = []
+    for seed in range(40):
+        new, _ = update(state, windows, jax.random.key(seed), jnp.int32(1))
+        auxiliary = not same(new.auxiliary.actor, state.auxiliary.actor)
+        assert same(new.actor, state.actor) == auxiliary
+        assert new.auxiliary.log_temperature != state.auxiliary.log_temperature
+        assert new.log_temperature != state.log_temperature
+        took.append(auxiliary)
+    assert 10 <= sum(took) <= 30
+    even, _ = update(state, windows, jax.random.key(0), jnp.int32(2))
+    assert same(even._replace(auxiliary=state.auxiliary), state)
+    assert same(even.auxiliary.actor, state.auxiliary.actor)
+    assert not same(even.auxiliary.critic, state.auxiliary.critic)
+
+
+def test_augmented_actor_follows_both_critics() -> None:
+    """A change of the second critic alone changes its update: the released code takes the first for both."""
+    agent, state = started()
+    now = agent.inputs(windows_of(), 0)
+    first, second = state.auxiliary.critic
+    lower = [*second[:-1], {"w": 2 * second[-1]["w"], "b": second[-1]["b"] - 100}]
+    other = state._replace(auxiliary=state.auxiliary._replace(critic=[first, lower]))
+    actors = [agent.improve_augmented(s, now, jax.random.key(0)).actor for s in (state, other)]
+    assert not same(*actors)
+
+
+def seen(seed: int, truth: bool = True) -> Seen:
+    rng = np.random.default_rng(seed)
+    obs = rng.normal(size=(2, OBS)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (DELAY, ACT)).astype(np.float32)
+    return Seen(jnp.asarray(obs[0]), jnp.int32(DELAY), jnp.asarray(actions), jnp.asarray(obs[1]) if truth else None)
+
+
+def test_behaviour_has_the_lower_q() -> None:
+    agent, state = started()
+    assert agent.privileged
+    act = jax.jit(functools.partial(agent.act, explore=True))
+    took = []
+    for seed in range(30):
+        what, key = seen(seed), jax.random.key(seed)
+        auxiliary_key, augmented_key = jax.random.split(key)
+        x = jnp.concatenate([what.obs, what.actions.reshape(-1), jnp.ones(1)])
+        pair = [
+            networks.sample(TINY.policy(state.auxiliary.actor, what.truth), auxiliary_key)[0],
+            networks.sample(TINY.policy(state.actor, x), augmented_key)[0],
+        ]
+        q = [float(networks.twin(state.auxiliary.critic, what.truth, action).min()) for action in pair]
+        np.testing.assert_allclose(act(state, what, key), pair[int(np.argmin(q))], atol=1e-6)
+        took.append(int(np.argmin(q)))
+    assert 0 < sum(took) < 30
+
+
+@pytest.mark.parametrize("auxiliary_delay", [0, 1, DELAY])
+def test_who_may_look(auxiliary_delay: int) -> None:
+    """Privileged with τ = 0 alone, unless told otherwise; never without `explore`."""
+    agent, state = started(auxiliary_delay)
+    assert agent.privileged == (auxiliary_delay == 0)
+    told = dataclasses.replace(agent, behaviour="augmented")
+    assert not told.privileged
+    what, key = seen(0, truth=False), jax.random.key(0)
+    action = told.act(state, what, key, explore=True)
+    if agent.privileged:
+        with pytest.raises(AssertionError, match="privileged"):
+            agent.act(state, what, key, explore=True)
+    else:
+        np.testing.assert_array_equal(agent.act(state, what, key, explore=True), action)
+    modes = [agent.act(state, what, jax.random.key(i), explore=False) for i in range(2)]
+    np.testing.assert_array_equal(*modes)
+
+
+def test_delay_free_policy_inside() -> None:
+    agent, state = started()
+    reference, inner = agent.reference_policy(state)
+    what = Seen(jnp.ones(OBS), jnp.int32(0), jnp.zeros((0, ACT)))
+    action = reference.act(inner, what, jax.random.key(0), explore=False)
+    expected = networks.mode(TINY.policy(state.auxiliary.actor, jnp.ones(OBS)))
+    np.testing.assert_array_equal(action, expected)
+    agent, state = started(1)
+    assert agent.reference_policy(state) is None
+
+
+def test_auxiliary_delay_is_not_longer() -> None:
+    ADSAC(TINY, DELAY).init(SPEC, jax.random.key(0))
+    with pytest.raises(DelayRLError, match="no longer than the delay 3; got 4"):
+        ADSAC(TINY, DELAY + 1).init(SPEC, jax.random.key(0))
+
+
+def test_the_loop_repeats_itself() -> None:
+    """Through the jitted loop, τ = 1: the same seed twice ends with the same parameters, all of them finite."""
+    agent, _ = started(1)
+    transitions, _ = record(ENV, DELAY, 40)
+
+    def run():
+        program = Program(agent, SPEC)
+        keys = jax.vmap(jax.random.key)(jnp.arange(1))
+        learner = program.init(keys, 100)
+        for step, transition in enumerate(transitions, 1):
+            batched = Transition(*(np.asarray(x)[None] for x in transition))
+            due = (0,) if step > 30 else ()
+            learner, metrics = program.learn(learner, batched, np.full(1, DELAY, np.int32), keys, step, due)
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
+        return learner.agent
+
+    first = run()
+    assert same(first, run())

@@ -1,0 +1,278 @@
+"""DC/AC: which steps count, what the target is, where the gradients flow."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from conftest import record
+from delayrl import networks
+from delayrl import replay as ring
+from delayrl.agents.dcac import DCAC, Roll, values
+from delayrl.errors import DelayRLError
+from delayrl.learning import Program
+from delayrl.types import Seen, Spec, Window
+from delayrl.views import network_input, view
+
+AGENT = DCAC(hidden=(16, 16), batch_size=16)
+DELAY = 4
+COUNTER = Spec(2, 1, DELAY)
+sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+
+
+def store(transitions, spec: Spec) -> ring.Replay:
+    replay, append = ring.init(spec, 300), jax.jit(ring.append)
+    for transition in transitions:
+        replay = append(replay, transition)
+    return replay
+
+
+@functools.cache
+def counter(kind: str) -> Window:
+    """Windows of an environment that counts: observation [t, T], reward t + 1, terminates after T = 4..10 steps."""
+    transitions, _ = record("delayrl/Counter-v0", DELAY, 150)
+    if kind == "truncated":
+        transitions = [t._replace(terminated=np.bool_(False)) for t in transitions]
+    if kind == "random":  # ages such as a random delay from 1..4 makes them, late observations ignored
+        transitions = [t._replace(age=age_at(t.obs), next_age=age_at(t.next_obs)) for t in transitions]
+    return sample(store(transitions, COUNTER), jax.random.key(0), 600, DELAY, DELAY, jnp.int32(2))
+
+
+def age_at(obs: np.ndarray) -> np.int32:
+    """A deterministic pattern in which an observation arrives for two steps, then none for two."""
+    time, length = (int(x) for x in obs)
+    newest = max([0, *(s for s in range(time) if s + 1 + (7 * s + length) % DELAY <= time)])
+    return np.int32(time - newest)
+
+
+@functools.cache
+def rolled(kind: str) -> tuple[Roll, DCAC, networks.Params]:
+    state = AGENT.init(COUNTER, jax.random.key(1))
+    keys = jax.random.split(jax.random.key(2), 600)
+    return jax.jit(jax.vmap(AGENT.roll, (None, 0, 0)))(state.actor, counter(kind), keys), AGENT, state.actor
+
+
+def worth(x: np.ndarray, endless: bool) -> float:
+    """The exact value of an augmented state of the counter: all rewards from its observation on, as they arrive."""
+    seen_time, length, age = x[0], x[1], round(float(x[-1]) * DELAY)
+    j = np.arange(seen_time, 4000 if endless else length)
+    return float((0.99 ** (j + DELAY - (seen_time + age)) * (j + 1)).sum())  # r_j arrives on the way to j + 1 + Δ
+
+
+def soft_returns(rolls: Roll, value: np.ndarray, agent: DCAC = AGENT) -> np.ndarray:
+    return np.asarray(agent.soft_return(rolls, agent.reward_scale, jnp.stack([value, value + 1.0])))
+
+
+@pytest.mark.parametrize("kind", ["terminated", "truncated"])
+def test_exact_values_are_the_fixed_point(kind: str) -> None:
+    """With the true V for its target networks, the target of every sample is the true V: starts, ends, hidden rows."""
+    rolls, _, _ = rolled(kind)
+    agent = dataclasses.replace(AGENT, reward_scale=1.0, entropy_scale=0.0)
+    value = np.array([worth(x, kind == "truncated") for x in np.asarray(rolls.x)])
+    last = np.array([worth(x, kind == "truncated") for x in np.asarray(rolls.x_last)], np.float32)
+    np.testing.assert_allclose(soft_returns(rolls, jnp.asarray(last), agent), value, rtol=1e-4, atol=1e-3)
+    assert len(np.unique(rolls.steps)) > 2  # mixed lengths
+    assert bool(rolls.ended.any()) == (kind == "terminated")
+    assert (np.asarray(rolls.x[:, -1]) < 1).any()  # starts of episodes: age below Δ
+
+
+def brute_force(window: Window, roll: Roll, value: float) -> tuple[int, float]:
+    """The number of steps and the target of one sample that starts at t, with plain loops."""
+    now, ages, rewards = DELAY, [int(a) for a in window.age], [float(r) for r in window.reward]
+    lead = int(window.lead)
+    if window.terminated.any():
+        ages[now + lead + 1 :] = [min(ages[now + lead] + i, DELAY) for i in range(1, DELAY - lead + 1)]
+        lead = DELAY
+    steps = 0
+    while steps < lead and ages[now + steps + 1] >= steps + 1:
+        steps += 1
+    total = 0.0
+    for i in range(steps):
+        arrives = sum(rewards[now + i - ages[now + i] : now + i + 1 - ages[now + i + 1]])
+        total += 0.99**i * (5.0 * arrives - float(roll.log_prob[i]))
+    return steps, total + 0.99**steps * value
+
+
+@pytest.mark.parametrize("kind", ["terminated", "truncated", "random"])
+def test_target_by_brute_force(kind: str) -> None:
+    rolls, _, _ = rolled(kind)
+    value = np.random.default_rng(0).normal(size=600).astype(np.float32)
+    y = soft_returns(rolls, jnp.asarray(value))
+    windows, rolls = jax.device_get((counter(kind), rolls))
+    lengths = set()
+    for i in np.flatnonzero(~rolls.ended):
+        window, roll = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (windows, rolls))
+        steps, target = brute_force(window, roll, float(value[i]))
+        assert steps == roll.steps
+        np.testing.assert_allclose(y[i], target, rtol=1e-4, atol=1e-4)
+        lengths.add(steps)
+    assert len(lengths) > 2 or kind == "terminated"
+
+
+def test_released_formula_by_hand() -> None:
+    """y = 5 r_0 - log π_0 + γ (5 r_1 - log π_1) + γ² min V at a constant delay of 2; and its actor's loss."""
+    roll = Roll(
+        x=jnp.zeros((2, 1)),
+        x_last=jnp.zeros((2, 1)),
+        reward=jnp.array([[1.0, 2.0], [1.0, 2.0]]),
+        log_prob=jnp.array([[0.5, -1.0], [0.5, -1.0]]),
+        steps=jnp.array([2, 1], jnp.int32),
+        ended=jnp.array([False, True]),
+    )
+    value = jnp.array([[10.0, 10.0], [9.0, 9.0]])
+    # 4.5 + .99 · 11 + .9801 · 9; and of one step, at whose end the terminal state shows: 4.5, and nothing of step 2
+    np.testing.assert_allclose(AGENT.soft_return(roll, 5.0, value), [24.2109, 4.5], rtol=1e-6)
+    np.testing.assert_allclose(AGENT.soft_return(roll, 0.0, value), [-0.5 + 0.99 + 8.8209, -0.5], rtol=1e-6)
+
+
+def test_stretch_is_the_past_with_new_actions() -> None:
+    """x_t is as recorded; x_{t+Δ} shows s_t with Δ new actions, drawn from the policy at the states between."""
+    rolls, agent, actor = rolled("truncated")
+    windows = counter("truncated")
+    policy = jax.jit(agent.policy)
+    whole = np.flatnonzero(np.asarray(rolls.steps) == DELAY)
+    assert len(whole) > 50
+    for i in whole[:40]:
+        window = jax.tree.map(lambda x, i=i: x[i], windows)
+        recorded = view(window)
+        np.testing.assert_array_equal(rolls.x[i], network_input(recorded, "augmented"))
+        x_last = np.asarray(rolls.x_last[i])
+        np.testing.assert_array_equal(x_last[:2], window.obs[DELAY])
+        new = x_last[2:-1]
+        history = np.concatenate([window.action[:DELAY, 0], new])
+        for step in range(DELAY):
+            age = int(window.age[DELAY + step])
+            seen = np.zeros((DELAY, 1), np.float32)
+            seen[:age, 0] = history[DELAY + step - age : DELAY + step]
+            x = Seen(window.obs[DELAY + step - age], jnp.int32(age), jnp.asarray(seen))
+            mean, log_std = policy(actor, network_input(x, "augmented"))
+            raw = np.arctanh(np.float64(new[step]))
+            normal = -0.5 * ((raw - mean) / np.exp(log_std)) ** 2 - log_std - 0.5 * np.log(2 * np.pi)
+            expected = float((normal - np.log(1 - np.tanh(raw) ** 2))[0])
+            np.testing.assert_allclose(rolls.log_prob[i, step], expected, rtol=1e-3, atol=2e-3)
+
+
+def test_the_delay_holds_the_terminal_state_back() -> None:
+    """Some values are learned after T, where x still shows a state before it; only those targets end in 0."""
+    rolls, _, _ = rolled("terminated")
+    windows = counter("terminated")
+    ended = np.asarray(rolls.ended)
+    over = np.asarray(windows.terminated.any(1))
+    assert not (ended & ~over).any()
+    assert 0.35 < ended[over].mean() < 0.65
+    np.testing.assert_array_equal(rolls.x[ended, 0], windows.obs[ended, DELAY, 0])  # s_t arrives at t + Δ
+    np.testing.assert_array_equal(rolls.x_last[ended, 0], rolls.x_last[ended, 1])  # the last shows t = T
+    np.testing.assert_array_equal(rolls.steps[ended], windows.lead[ended])
+    np.testing.assert_allclose(rolls.reward[ended, 0], rolls.x[ended, 0] + 1)
+    recorded = [network_input(view(jax.tree.map(lambda x, i=i: x[i], windows)), "augmented") for i in range(600)]
+    np.testing.assert_array_equal(rolls.x[~ended], np.stack(recorded)[~ended])
+
+
+@functools.cache
+def parts():
+    transitions, _ = record("Reacher-v5", 3, 60)
+    spec = Spec(10, 2, 3)
+    return AGENT.init(spec, jax.random.key(0)), sample(store(transitions, spec), jax.random.key(0), 16, 3, 3, 0)
+
+
+def test_gradients() -> None:
+    """The critics learn from their error alone; the actor from the new actions inside x, through frozen critics."""
+    state, windows = parts()
+    zero = jax.tree.map(jnp.zeros_like, state.critic)
+
+    def gradient(agent: DCAC, critic):
+        loss = functools.partial(agent.loss, target=state.target, windows=windows, key=jax.random.key(5))
+        return jax.grad(lambda params: loss(params)[0])((state.actor, critic))
+
+    def size(tree) -> float:
+        return float(sum(jnp.abs(x).sum() for x in jax.tree.leaves(tree)))
+
+    only_actor = dataclasses.replace(AGENT, actor_share=1.0, entropy_scale=0.0)
+    of_actor, of_critic = gradient(only_actor, state.critic)
+    assert size(of_actor) > 1e-4  # without entropy: through V(x_n), whose only new part is its actions
+    assert size(of_critic) == 0
+    assert size(gradient(only_actor, zero)[0]) == 0
+    of_actor, of_critic = gradient(dataclasses.replace(AGENT, actor_share=0.0), state.critic)
+    assert size(of_actor) == 0
+    assert size(of_critic) > 0
+
+
+def test_gradient_reaches_the_first_action() -> None:
+    """Each of the Δ new actions is one that the value at the end of the stretch can blame."""
+    state, windows = parts()
+    window = jax.tree.map(lambda x: x[0], windows)
+
+    def last_value(actor):
+        return values(state.critic, AGENT.roll(actor, window, jax.random.key(0)).x_last).min()
+
+    slopes = jax.grad(lambda x: values(state.critic, x).min())(
+        AGENT.roll(state.actor, window, jax.random.key(0)).x_last
+    )
+    assert (jnp.abs(slopes[10:16]) > 0).all()
+    change = jax.grad(last_value)(state.actor)
+    assert all((jnp.abs(x) > 0).any() for x in jax.tree.leaves(change))
+
+
+def test_update() -> None:
+    """Everything moves, the targets by τ; the same key gives the same; no metric is missing."""
+    state, windows = parts()
+    update = jax.jit(AGENT.update)
+    once, metrics = update(state, windows, jax.random.key(1), jnp.int32(0))
+    again, _ = update(state, windows, jax.random.key(1), jnp.int32(7))
+    for a, b in zip(jax.tree.leaves(once), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert set(metrics) == {"critic_loss", "actor_loss", "value", "entropy", "target_steps"}
+    for old, new in ((state.actor, once.actor), (state.critic, once.critic)):
+        assert not all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True))
+    expected = jax.tree.map(lambda t, c: 0.995 * t + 0.005 * c, state.target, once.critic)
+    for a, b in zip(jax.tree.leaves(once.target), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_act() -> None:
+    state, _ = parts()
+    seen = Seen(jnp.ones(10), jnp.int32(2), jnp.zeros((3, 2)).at[:2].set(0.3))
+    mode = AGENT.act(state, seen, jax.random.key(0), explore=False)
+    np.testing.assert_array_equal(mode, AGENT.act(state, seen, jax.random.key(1), explore=False))
+    drawn = AGENT.act(state, seen, jax.random.key(0), explore=True)
+    assert not np.array_equal(drawn, AGENT.act(state, seen, jax.random.key(1), explore=True))
+    other = AGENT.act(state, seen._replace(actions=-seen.actions), jax.random.key(0), explore=False)
+    assert not np.array_equal(mode, other)
+    assert not AGENT.privileged
+    assert AGENT.reference_policy(state) is None
+    with pytest.raises(DelayRLError, match="at least 1 step"):
+        AGENT.init(Spec(10, 2, 0), jax.random.key(0))
+
+
+def test_learning_under_the_loop() -> None:
+    """What has not arrived may be anything; and two seeds beside each other learn what each learns alone."""
+    data = [record("Reacher-v5", 3, 40, seed)[0] for seed in range(2)]
+    program = Program(AGENT, Spec(10, 2, 3))
+
+    def run(seeds: list[int], poison: bool = False):
+        keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+        learner = program.init(keys, 100)
+        for step in range(1, 41):
+            batch = jax.tree.map(lambda *x: np.stack(x), *[data[s][step - 1] for s in seeds])
+            if poison and step > 37:  # s_38, s_39, s_40 have not arrived
+                bad = {"next_obs": np.full_like(batch.next_obs, 1e6), "reward": np.full_like(batch.reward, -1e6)}
+                batch = batch._replace(**bad, **({"obs": bad["next_obs"]} if step > 38 else {}))
+            due = (0,) if step == 40 else ()
+            learner, metrics = program.learn(learner, batch, np.full(len(seeds), 3, np.int32), keys, step, due)
+        assert all(np.isfinite(x).all() for x in metrics.values())
+        return jax.device_get(learner.agent)
+
+    together, alone = run([0, 1]), run([1])
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_allclose(a[1], b[0], rtol=1e-4, atol=1e-5)
+    for a, b in zip(jax.tree.leaves(run([1], poison=True)), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_defaults_are_the_released_codes() -> None:
+    assert (DCAC().batch_size, DCAC().learning_rate, DCAC().hidden) == (128, 3e-4, (256, 256))
+    assert (DCAC().reward_scale, DCAC().entropy_scale, DCAC().actor_share) == (5.0, 1.0, 0.2)
+    assert (DCAC().discount, DCAC().target_rate, DCAC().log_std_range) == (0.99, 5e-3, (-20.0, 2.0))
