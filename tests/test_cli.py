@@ -13,10 +13,9 @@ from delayrl.cli import main
 from delayrl.config import options
 from delayrl.runs import Run
 
-SMALL = (
-    ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2", "--batch-size", "8", "--hidden", "8", "8"]
-)
-TINY = [*SMALL, *["--width", "8", "--layers", "1", "--clone-every", "40", "--clone-updates", "3", "--quiet"]]
+SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
+SMALL += ["--batch-size", "8", "--hidden", "8", "8"]
+TINY = [*SMALL, "--width", "8", "--layers", "1", "--clone-every", "40", "--clone-updates", "3", "--quiet"]
 
 
 @pytest.fixture(scope="module")

@@ -69,5 +69,6 @@ def test_loop_names_no_algorithm() -> None:
 def test_files_stay_readable() -> None:
     for file in (SOURCE / "agents").glob("*.py"):
         assert len(file.read_text().splitlines()) <= 260, file
-    path = ["types", "wrappers", "views", "replay", "networks", "objectives", "agents/base", "agents/sac", "acting", "learning"]
+    path = ["types", "wrappers", "views", "replay", "networks", "objectives", "agents/base", "agents/sac"]
+    path += ["acting", "learning"]
     assert sum(len((SOURCE / f"{name}.py").read_text().splitlines()) for name in path) <= 1200

@@ -10,10 +10,6 @@ from delayrl.agents.base import Agent, Schedule
 from delayrl.learning import Learner, Program
 from delayrl.types import Spec
 
-UTILISATION * rate) + 3e-4)
-    return seconds
-
-
 UTILISATION = 0.25
 """Share of the matmul rate that an update reaches on a CPU, measured on presets `small` and `paper`."""
 
@@ -30,17 +26,14 @@ def estimate_seconds(
         multiply(square).block_until_ready()
     rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
     seconds = (schedule.steps - step) * 2e-4
-    replay = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.replay)
-    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), learner.agent)
+    replay, state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (learner.replay, learner.agent))
     seeds = learner.replay.rows.shape[0]
+    key, number = jax.eval_shape(lambda: jax.random.key(0)), jax.ShapeDtypeStruct((), jnp.int32)
     for phase in program.phases:
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        number = jax.ShapeDtypeStruct((), jnp.int32)
         reach = (phase.batch, spec.delay, agent.ahead(spec))
-        windows = jax.eval_shape(
-            lambda r, k, h, reach=reach: ring.sample(r, k, reach[0], reach[1], reach[2], h), replay, key, number
-        )
+        windows = jax.eval_shape(lambda r, k, h, n=reach: ring.sample(r, k, n[0], n[1], n[2], h), replay, key, number)
         cost = jax.jit(phase.update).lower(state, windows, key, number).cost_analysis()
         flops = float((cost or {}).get("flops", 0.0))
         rounds = (schedule.steps - max(step, schedule.random_steps)) / phase.every
-        seconds += max(rounds, 0) * phase.updates * seeds * (flops / (
+        seconds += max(rounds, 0) * phase.updates * seeds * (flops / (UTILISATION * rate) + 3e-4)
+    return seconds

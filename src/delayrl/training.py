@@ -29,8 +29,8 @@ from delayrl.agents.base import Agent, Schedule, template
 from delayrl.config import check_names, override, values_of
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
-from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, reset_seed
 from delayrl.estimate import estimate_seconds
+from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, reset_seed
 from delayrl.learning import compiled
 from delayrl.plots import curve
 from delayrl.policy import spec_of
