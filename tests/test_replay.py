@@ -71,6 +71,21 @@ def test_every_start_is_drawn_equally() -> None:
     assert steps == {1}
 
 
+def test_official_starts() -> None:
+    """With `whole` = 3 the last two starts of an episode are never drawn, and all others are."""
+    transitions, _ = record(TASK, 2, 120)
+    replay = ring.init(Spec(2, 1, 2), 500)
+    for transition in transitions:
+        replay = jax.jit(ring.append, static_argnames="whole")(replay, transition, whole=3)
+    windows = draw(replay, 20_000, 2, 3)
+    assert int(windows.lead.min()) == 3
+    complete = [t for t in transitions if t.obs[0] <= t.obs[1] - 3]
+    drawn = set(np.asarray(windows.action[:, 2, 0]).tolist())
+    unfinished = {float(t.action[0]) for t in transitions[-10:] if not transitions[-1].done}
+    assert {float(t.action[0]) for t in complete} - unfinished <= drawn
+    assert drawn <= {float(t.action[0]) for t in complete}
+
+
 def test_round_trip() -> None:
     """What the wrapper showed is what `view` makes of the replay, at every step and every shorter delay."""
     for delay in (0, 1, 4, 9):

@@ -123,10 +123,13 @@ class KilledError(Exception):
     pass
 
 
-@pytest.mark.parametrize(("agent", "at"), [("vdpo", 237), ("bpql", 160), ("random", 299)])
-def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("agent", "at", "protocol"),
+    [("vdpo", 237, "corrected"), ("bpql", 160, "corrected"), ("bpql", 260, "official"), ("random", 299, "corrected")],
+)
+def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str, tmp_path: Path, monkeypatch) -> None:
     """Bit for bit: rows and parameters, with a replay that has gone round, and an episode cut in its middle."""
-    whole = train(agent, tmp_path / "whole")
+    whole = train(agent, tmp_path / "whole", protocol=protocol)
     step = Actor.step
     calls = 0
 
@@ -139,14 +142,14 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, tmp_path: Path
 
     monkeypatch.setattr(Actor, "step", dying)
     with pytest.raises(KilledError):
-        train(agent, tmp_path / "cut")
+        train(agent, tmp_path / "cut", protocol=protocol)
     monkeypatch.setattr(Actor, "step", step)
     run = Run(tmp_path / "cut")
     assert run.latest().step == at // 100 * 100
     run.append("rows", [{"step": 299, "policy": "agent", "return": 0.0}])  # made after the checkpoint
     with open(run.path / "rows.jsonl", "a") as file:
         file.write('{"step": 299, "pol')
-    resumed = train(agent, tmp_path / "cut")
+    resumed = train(agent, tmp_path / "cut", protocol=protocol)
     assert resumed.read("rows") == whole.read("rows")
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
@@ -271,6 +274,22 @@ def test_full_disk(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(os, "fsync", fsync)
     whole = train("bpql", tmp_path / "whole")
     assert train("bpql", tmp_path / "run").read("rows") == whole.read("rows")
+
+
+def test_official_protocol(tmp_path: Path) -> None:
+    """One start state for all episodes, time limits as terminations, a random first action: stated in every row."""
+    run = train("a-sac", tmp_path / "run", protocol="official", steps=150)
+    rows = run.read("rows")
+    assert {row["reset_seed"] for row in rows} == {0}
+    assert {row["protocol"] for row in rows} == {"official"}
+    assert len({row["return"] for row in rows if row["step"] == 100}) == 2  # the first actions differ
+    actor = Actor(make("Reacher-v5", 3, rescale=True), 7, privileged=False, official=True)
+    actor.reset()
+    first = actor.truth
+    steps = [actor.step(np.zeros(2, np.float32)) for _ in range(50)]
+    assert steps[-1].done
+    assert steps[-1].terminated
+    np.testing.assert_array_equal(actor.truth, first)
 
 
 def test_options_round_trip() -> None:

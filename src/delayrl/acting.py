@@ -20,15 +20,17 @@ class Actor:
     env: DelayedObservation
     seed: int
     privileged: bool
+    official: bool = False
     episode: int = 0
     actions: list[NDArray[np.float32]] = field(default_factory=list)
     seen: Seen = None  # type: ignore[assignment]
     truth: NDArray[np.float32] = None  # type: ignore[assignment]
 
     def reset(self) -> None:
-        """Start the next episode, from its own seed."""
+        """Start the next episode, from its own seed (official protocol: always from the same)."""
         self.actions = []
-        self._see(*self.env.reset(seed=reset_seed(self.seed, TRAINING, self.episode)))
+        seed = self.seed if self.official else reset_seed(self.seed, TRAINING, self.episode)
+        self._see(*self.env.reset(seed=seed))
 
     def step(self, action: NDArray[np.float32]) -> Transition:
         """Act; start the next episode where this one ends."""
@@ -48,7 +50,7 @@ class Actor:
             age,
             action,  # type: ignore[arg-type]
             np.float32(reward),  # type: ignore[arg-type]
-            np.bool_(terminated),  # type: ignore[arg-type]
+            np.bool_(done if self.official else terminated),  # type: ignore[arg-type]
             np.bool_(done),  # type: ignore[arg-type]
             self.truth,  # type: ignore[arg-type]
             self.seen.age,

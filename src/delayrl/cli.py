@@ -91,6 +91,9 @@ def _train(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="the run folder (default: below runs/)")
     parser.add_argument("--device", choices=["cpu", "gpu"], help="(default: what JAX finds)")
     parser.add_argument("--overwrite", action="store_true", help="start afresh where a run exists")
+    parser.add_argument(
+        "--protocol", choices=["corrected", "official"], default="corrected", help="official: as the released code does"
+    )
     parser.add_argument("--track", choices=["tensorboard", "wandb"], help="log there too")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     for title, config in (("schedule", base.schedule), ("hyperparameters", base.agent)):

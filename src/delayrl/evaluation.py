@@ -49,8 +49,14 @@ class Evaluator:
         self._envs = [[make(env, law, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
         self._act = _compiled_act(agent)
 
-    def __call__(self, states: State, reset_seeds: Sequence[Sequence[int]], keys: Key) -> Episodes:
-        """Play one episode from each reset seed, [seeds, episodes]."""
+    def __call__(
+        self,
+        states: State,
+        reset_seeds: Sequence[Sequence[int]],
+        keys: Key,
+        first: NDArray[np.float32] | None = None,
+    ) -> Episodes:
+        """Play one episode from each reset seed, [seeds, episodes]; with `first` for the first actions, [.., .., A]."""
         shape = (len(self._envs), len(self._envs[0]))
         returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
         seen = [
@@ -61,6 +67,7 @@ class Evaluator:
         while running.any():
             batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
             actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
+            actions = first if step == 0 and first is not None else actions
             step += 1
             for i, j in np.argwhere(running):
                 obs, reward, terminated, truncated, info = self._envs[i][j].step(actions[i, j])

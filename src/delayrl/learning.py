@@ -27,8 +27,8 @@ class Program:
     Made by `compiled`, which gives the same agent on the same task the same functions again.
     """
 
-    def __init__(self, agent: Agent, spec: Spec):
-        self.phases, self._agent, self._spec = agent.phases(), agent, spec
+    def __init__(self, agent: Agent, spec: Spec, whole: int = 1):
+        self.phases, self._agent, self._spec, self._whole = agent.phases(), agent, spec, whole
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="index", donate_argnums=0)
 
@@ -85,7 +85,7 @@ class Program:
     ) -> tuple[Learner, Metrics]:
         agent, replay = learner
         if transition is not None:
-            replay = jax.vmap(ring.append)(replay, transition)
+            replay = jax.vmap(functools.partial(ring.append, whole=self._whole))(replay, transition)
         if index is None:
             return Learner(agent, replay), {}
         phase = self.phases[index]

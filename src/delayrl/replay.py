@@ -46,14 +46,18 @@ def init(spec: Spec, capacity: int) -> Replay:
     )
 
 
-def append(replay: Replay, step: Transition) -> Replay:
-    """Store one step: its row, and its outcome in the next row, which the episode's next step will complete."""
+def append(replay: Replay, step: Transition, whole: int = 1) -> Replay:
+    """Store one step: its row, and its outcome in the next row, which the episode's next step will complete.
+
+    A step can be drawn once `whole` steps of its episode are there, itself included: with 1 every one, with more the
+    last whole - 1 of an episode never (as released code whose n-step window is cleared at its end).
+    """
     capacity = replay.obs.shape[0]
     here, after = replay.rows % capacity, (replay.rows + 1) % capacity
     rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps its last observation's row
     moment = replay.moment[here] + 1
-    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows)
-    steps, lost = replay.steps + 1, replay.lost
+    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (whole - 1))
+    steps, lost = replay.steps + (moment >= whole), replay.lost
     for _ in range(2):  # at most two rows are overwritten
         lost += ((lost < steps) & (row_of[lost % capacity] <= rows - capacity)).astype(jnp.int32)
     return Replay(

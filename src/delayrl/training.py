@@ -54,6 +54,7 @@ def train(
     out: str | Path | None = None,
     device: str | None = None,
     overwrite: bool = False,
+    protocol: str = "corrected",
     track: str | None = None,
     progress: bool = True,
     **values: Any,
@@ -70,6 +71,7 @@ def train(
         out: the run folder; with several seeds the folder of their run folders.
         device: "cpu" or "gpu"; None leaves the choice to JAX.
         overwrite: start afresh where a run exists.
+        protocol: "corrected", or "official": the released code's habits (docs/concepts.md).
         track: "tensorboard" or "wandb" as well (extras of the same names).
         progress: show a progress bar and notes on stderr.
         **values: any hyperparameter or schedule option by name.
@@ -86,8 +88,11 @@ def train(
     for name, number in (("seed", seed), ("seeds", seeds - 1)):
         if number < 0:
             raise DelayRLError(f"{name} must be {'at least 1' if name == 'seeds' else 'no less than 0'}")
+    if protocol not in ("corrected", "official"):
+        raise DelayRLError(f"protocol must be corrected or official; got {protocol!r}")
     base = entry.presets[preset]
     check_names(values, base.agent, base.schedule)
+    values = (dict(entry.official) if protocol == "official" else {}) | values
     config, schedule = override(base.agent, values), override(base.schedule, values)
     group = (
         Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / f"{agent}-{preset}"
@@ -97,13 +102,13 @@ def train(
 
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
     with on_device(device):
-        session = Session(config, schedule, env, delay, [seed + i for i in range(seeds)])
+        session = Session(config, schedule, env, delay, [seed + i for i in range(seeds)], protocol == "official")
         description = {
             "agent": agent,
             "preset": preset,
             "env": env,
             "delay": delay,
-            "protocol": "corrected",
+            "protocol": protocol,
             "privileged": config.privileged,
             "hyperparameters": values_of(config),
             "schedule": values_of(schedule),
@@ -116,20 +121,23 @@ def train(
 class Session:
     """One call of `train`: the seeds' environments and learners, and where they are written."""
 
-    def __init__(self, agent: Agent, schedule: Schedule, env: str, delay: int, seeds: list[int]):
+    def __init__(
+        self, agent: Agent, schedule: Schedule, env: str, delay: int, seeds: list[int], official: bool = False
+    ):
         self.agent, self.schedule, self.env, self.delay, self.seeds = agent, schedule, env, delay, seeds
-        self.actors = [Actor(make(env, delay, rescale=True), seed, agent.privileged) for seed in seeds]
+        self.official = official
+        self.actors = [Actor(make(env, delay, rescale=True), seed, agent.privileged, official) for seed in seeds]
         self.spec = spec_of(self.actors[0].env)
         least = 2 * (self.spec.delay + agent.ahead(self.spec)) + 2
         if schedule.replay_capacity < least:
             raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
         self.template = template(agent, self.spec)  # says what does not fit, before anything is stored
-        self.program = compiled(agent, self.spec)
+        self.program = compiled(agent, self.spec, agent.ahead(self.spec) if official else 1)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step = 0
         self.pending: Transition | None = None
         self.stored: list[dict[str, str]] = [{} for _ in seeds]
-        self.stored_rows = [0 for _ in seeds]
+        self.stored_until = [(0, 0) for _ in seeds]  # rows and steps of the replay that are in its pieces
 
     # -- the run folders -------------------------------------------------------------------------------------------
 
@@ -197,7 +205,7 @@ class Session:
             for name in ("rows", "steps", "lost"):
                 columns[name] = loop[name]
             replays.append(ring.Replay(**columns))  # type: ignore[arg-type]
-            self.stored[i], self.stored_rows[i] = dict(checkpoint.pieces), int(loop["rows"])
+            self.stored[i], self.stored_until[i] = dict(checkpoint.pieces), (int(loop["rows"]), int(loop["steps"]))
             pending.append(Transition(**{name: loop[f"pending.{name}"] for name in Transition._fields}))  # type: ignore[arg-type]
             self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
             if not np.array_equal(self.actors[i].truth, loop["truth"]):
@@ -217,10 +225,11 @@ class Session:
                 continue
             replay = self.learner.replay
             rows, steps, lost = (int(x[i]) for x in (replay.rows, replay.steps, replay.lost))
-            first = max(self.stored_rows[i], rows - self.schedule.replay_capacity + 1, 0)
+            known_rows, known_steps = self.stored_until[i]
+            first = max(known_rows, rows - self.schedule.replay_capacity + 1, 0)
             name = f"{first:012d}-{rows:012d}.safetensors"
-            self.stored[i][name] = run.save_piece(name, _cut(replay, i, first, rows, steps))
-            self.stored_rows[i] = rows
+            self.stored[i][name] = run.save_piece(name, _cut(replay, i, first, rows, known_steps, steps))
+            self.stored_until[i] = rows, steps
             alive = rows - self.schedule.replay_capacity
             self.stored[i] = {n: d for n, d in self.stored[i].items() if int(n[13:25]) > alive}
             assert self.pending is not None
@@ -273,6 +282,9 @@ class Session:
                     )
                     metrics |= new
                 actions = self._random(step) if chosen is None else np.asarray(chosen)
+                if self.official and self.spec.delay:  # its first action under delay is random
+                    first = np.array([[actor.seen.age == 0] for actor in self.actors])
+                    actions = np.where(first, self._random(step), actions)
                 steps = [actor.step(action) for actor, action in zip(self.actors, actions, strict=True)]
                 self.pending = jax.tree.map(lambda *x: np.stack(x), *steps)
                 self.step += 1
@@ -312,9 +324,15 @@ class Session:
         summary = []
         episodes = range(self.schedule.evaluation_episodes)
         seeds = [[reset_seed(seed, EVALUATION, self.step, e) for e in episodes] for seed in self.seeds]
+        first = None
+        if self.official:  # one start state for all episodes, and a random first action under delay
+            draw = [
+                [np.random.default_rng(number).uniform(-1, 1, self.spec.action_size) for number in s] for s in seeds
+            ]
+            first, seeds = np.array(draw, np.float32), [[seed] * len(episodes) for seed in self.seeds]
         keys = jax.vmap(lambda key: jax.random.fold_in(key, self.step))(self.keys)
         for policy, evaluator in evaluators.items():
-            played = evaluator(states[policy], seeds, keys)
+            played = evaluator(states[policy], seeds, keys, first if policy == "agent" and self.delay else None)
             summary.append(f"{policy} {played.returns.mean():.4g}")
             for i, (run, tracker) in enumerate(zip(self.runs, trackers, strict=True)):
                 run.append("rows", [self._row(i, policy, e, seeds[i][e], played) for e in episodes])
@@ -396,16 +414,15 @@ def stop_signal() -> Iterator[threading.Event]:
             signal.signal(kind, handler)
 
 
-def _cut(replay: ring.Replay, seed: int, first: int, last: int, steps: int) -> Arrays:
-    """Rows first..last of one seed's ring, and the steps that start in them."""
+def _cut(replay: ring.Replay, seed: int, first: int, last: int, first_step: int, steps: int) -> Arrays:
+    """Rows first..last of one seed's ring, and the rows of its steps from `first_step` on."""
     capacity = replay.obs.shape[1]
     index = np.arange(first, last + 1) % capacity
     columns = ("obs", "action", "reward", "age", "terminated", "moment")
     piece: Arrays = {name: np.asarray(getattr(replay, name)[seed][index]) for name in columns}
-    numbers = np.arange(max(0, steps - capacity), steps)
+    numbers = np.arange(max(first_step, steps - capacity), steps)
     row_of = np.asarray(replay.row_of[seed])[numbers % capacity]
-    mine = row_of >= first
-    return piece | {"rows": np.arange(first, last + 1), "steps": numbers[mine], "row_of": row_of[mine]}
+    return piece | {"rows": np.arange(first, last + 1), "steps": numbers, "row_of": row_of}
 
 
 def _paste(columns: Arrays, piece: Arrays) -> None:

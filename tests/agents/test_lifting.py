@@ -15,7 +15,7 @@ from delayrl import replay as ring
 from delayrl.agents import lifting
 from delayrl.agents.lifting import BPQL, Lifting, lifting_loss, moments
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program
+from delayrl.learning import compiled
 from delayrl.networks import Gaussian
 from delayrl.types import Seen, Spec, Transition, Window
 from delayrl.views import look
@@ -215,7 +215,7 @@ def test_hold_is_before_end() -> None:
 
 
 def run(transitions, hidden: int):
-    program = Program(TINY, SPEC)
+    program = compiled(TINY, SPEC)
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
     learner = program.init(keys, 100)
     for step, transition in enumerate(transitions, 1):

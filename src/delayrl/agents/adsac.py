@@ -1,4 +1,4 @@
-"""Auxiliary-delayed SAC, AD-SAC (Wu et al., "Boosting reinforcement learning with strongly delayed feedback", ICML 2024).
+"""Auxiliary-delayed SAC (Wu et al., "Boosting reinforcement learning with strongly delayed feedback", ICML 2024).
 
 Idea: values of the augmented state x_t are hard to learn, since it grows with the delay Δ. So learn them for a shorter,
 auxiliary delay τ < Δ, together with an actor that acts under τ; and improve the actor that must live with Δ by those

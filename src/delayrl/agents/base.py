@@ -1,8 +1,9 @@
 """What an agent is, and what the loop must know of it. Documentation: there is no behaviour here to inherit."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -86,6 +87,7 @@ class Entry(NamedTuple):
     summary: str
     paper: str
     presets: dict[str, Preset]
+    official: Mapping[str, Any] = MappingProxyType({})  # hyperparameters that the official protocol changes
 
 
 def template(agent: Agent, spec: Spec) -> State:

@@ -1,0 +1,171 @@
+"""DIDA: who acts when, who learns what, and what is imitated."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from conftest import record
+from delayrl import replay as ring
+from delayrl.agents.dida import DIDA
+from delayrl.agents.sac import SAC
+from delayrl.errors import DelayRLError
+from delayrl.learning import Program
+from delayrl.networks import mode
+from delayrl.types import Seen, Spec, Window
+from delayrl.views import network_input, view
+
+AGENT = DIDA(
+    SAC(hidden=(16, 16), batch_size=16), expert_steps=20, round_steps=10, imitation_updates=3, student_hidden=(8, 8)
+)
+SPEC = Spec(10, 2, 3)
+
+
+@functools.cache
+def parts():
+    transitions, _ = record("Reacher-v5", 3, 90)
+    replay, append = ring.init(SPEC, 200), jax.jit(ring.append)
+    for transition in transitions:
+        replay = append(replay, transition)
+    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 32, 3, 3, 0)
+    return AGENT.init(SPEC, jax.random.key(0)), windows
+
+
+def same(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+@functools.cache
+def update():
+    return jax.jit(AGENT.update)
+
+
+@functools.cache
+def imitate():
+    return jax.jit(AGENT.imitate)
+
+
+def test_the_expert_learns_as_sac_and_is_frozen_after_its_steps() -> None:
+    state, windows = parts()
+    at_its_end, metrics = update()(state, windows, jax.random.key(1), jnp.int32(20))
+    sac, of_sac = jax.jit(AGENT.reference.update)(state.reference, windows, jax.random.key(1), jnp.int32(20))
+    for a, b in zip(jax.tree.leaves((at_its_end.reference, metrics)), jax.tree.leaves((sac, of_sac)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+    assert metrics.keys() == of_sac.keys()
+    assert same((at_its_end.student, at_its_end.memory), (state.student, state.memory))
+    after, idle = update()(state, windows, jax.random.key(1), jnp.int32(21))
+    assert same(after.reference, state.reference)
+    assert same((after.student, after.memory), (state.student, state.memory))
+    assert {float(x) for x in idle.values()} == {0.0}
+    assert int(after.steps) == 21
+
+
+def test_imitation_waits_for_the_expert() -> None:
+    """Rounds end at the steps 10, 20, 30, …: the student learns from the round that ends at 20 on, alone."""
+    state, windows = parts()
+    for count in (3, 5):  # the updates of the round at step 10
+        assert same(imitate()(state, windows, jax.random.key(1), jnp.int32(count))[0], state)
+    for count in (6, 8, 9):  # of those at 20 and 30
+        learned, metrics = imitate()(state, windows, jax.random.key(1), jnp.int32(count))
+        assert not same(learned.student, state.student)
+        assert same(learned.reference, state.reference)
+        assert same(learned.steps, state.steps)
+        assert metrics["imitation_loss"] > 0
+
+
+def test_imitation_loss_by_hand() -> None:
+    """Σ over batch and dimensions of |student(x_t) - expert(s_t)|; x_t as the actor saw it, starts included."""
+    state, windows = parts()
+    loss, _ = AGENT.imitation_loss(state.student, state.reference.actor, windows)
+    total, ages = 0.0, set()
+    for i in range(32):
+        window: Window = jax.tree.map(lambda x, i=i: x[i], windows)
+        x = np.asarray(network_input(view(window), "augmented"))
+        for layer in state.student[:-1]:
+            x = np.maximum(x @ np.asarray(layer["w"]) + np.asarray(layer["b"]), 0)
+        student = np.tanh(x @ np.asarray(state.student[-1]["w"]) + np.asarray(state.student[-1]["b"]))
+        expert = mode(AGENT.reference.policy(state.reference.actor, window.obs[3]))
+        total += np.abs(student - np.asarray(expert)).sum()
+        ages.add(int(window.age[3]))
+    np.testing.assert_allclose(loss, total, rtol=1e-4)
+    assert len(ages) > 1  # starts of episodes
+
+
+def test_rmsprop_is_pytorchs() -> None:
+    """w ← w - lr g / (√v + ε), v ← .9 v + .1 g²: the first step is lr / √.1 in every direction with a gradient."""
+    optimiser = DIDA().optimiser
+    gradient = jnp.array([2.0, -0.5, 0.0])
+    change, memory = optimiser.update(gradient, optimiser.init(jnp.zeros(3)))
+    np.testing.assert_allclose(change, [-1e-3 / 0.1**0.5, 1e-3 / 0.1**0.5, 0], rtol=1e-5)
+    change, _ = optimiser.update(gradient, memory)
+    np.testing.assert_allclose(change, [-1e-3 / 0.19**0.5, 1e-3 / 0.19**0.5, 0], rtol=1e-5)
+
+
+def test_who_acts() -> None:
+    """The expert, exploring on the true state, until `expert_steps` have been learned from; then the student alone."""
+    state, _ = parts()
+    draw = np.random.default_rng(0).normal(size=(2, 10)).astype(np.float32)
+    seen = Seen(jnp.asarray(draw[0]), jnp.int32(2), jnp.zeros((3, 2)).at[:2].set(0.3), jnp.asarray(draw[1]))
+    blind = seen._replace(truth=None)
+    student = AGENT.act(state, blind, jax.random.key(0), explore=False)
+    np.testing.assert_array_equal(student, AGENT.policy(state.student, network_input(seen, "augmented")))
+    for steps in (0, 19):
+        early = state._replace(steps=jnp.int32(steps))
+        current = Seen(seen.truth, jnp.int32(0), jnp.zeros((0, 2)))
+        expert = AGENT.reference.act(state.reference, current, jax.random.key(7), explore=True)
+        np.testing.assert_allclose(AGENT.act(early, seen, jax.random.key(7), explore=True), expert, rtol=1e-6)
+        np.testing.assert_array_equal(AGENT.act(early, blind, jax.random.key(7), explore=False), student)
+    late = state._replace(steps=jnp.int32(20))
+    np.testing.assert_array_equal(AGENT.act(late, seen, jax.random.key(7), explore=True), student)
+    with pytest.raises(AssertionError, match="privileged"):
+        AGENT.act(state, blind, jax.random.key(0), explore=True)
+    assert AGENT.privileged
+    agent, inner = AGENT.reference_policy(state)
+    assert agent == AGENT.reference
+    assert inner is state.reference
+
+
+def test_it_asks_for_what_it_needs() -> None:
+    with pytest.raises(DelayRLError, match="at least 1 step"):
+        AGENT.init(Spec(10, 2, 0), jax.random.key(0))
+    with pytest.raises(DelayRLError, match="whole rounds of 10 steps; got 25"):
+        dataclasses.replace(AGENT, expert_steps=25).init(SPEC, jax.random.key(0))
+
+
+def test_under_the_loop() -> None:
+    """The phases in order; the first imitation comes before the student acts; seeds in lockstep are seeds alone."""
+    data = [record("Reacher-v5", 3, 31, seed)[0] for seed in range(2)]
+    program = Program(AGENT, SPEC)
+
+    def run(seeds: list[int]) -> list:
+        keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+        learner, states = program.init(keys, 100), []
+        for step in range(1, 32):
+            due = tuple(i for i, p in enumerate(program.phases) if step > 8 and step % p.every == 0)
+            batch = jax.tree.map(lambda *x: np.stack(x), *[data[s][step - 1] for s in seeds])
+            learner, metrics = program.learn(learner, batch, np.zeros(len(seeds), np.int32), keys, step, due)
+            assert all(np.isfinite(x).all() for x in metrics.values())
+            states.append(jax.device_get(learner.agent))
+        return states
+
+    states = run([0, 1])
+    for step in range(1, 32):
+        assert list(states[step - 1].steps) == [step if step > 8 else 0] * 2
+    learned = [step for step in range(2, 32) if not same(states[step - 1].student, states[step - 2].student)]
+    assert learned == [20, 30]
+    improved = [step for step in range(2, 32) if not same(states[step - 1].reference, states[step - 2].reference)]
+    assert improved == list(range(9, 21))
+    for a, b in zip(jax.tree.leaves(states[-1]), jax.tree.leaves(run([1])[-1]), strict=True):
+        np.testing.assert_allclose(a[1], b[0], rtol=1e-4, atol=1e-5)
+    assert same(states[-1], run([0, 1])[-1])
+
+
+def test_defaults_are_the_released_codes() -> None:
+    agent = DIDA()
+    assert (agent.student_hidden, agent.student_batch_size) == ((100, 100), 32)
+    assert (agent.student_learning_rate, agent.student_decay, agent.round_steps) == (1e-3, 0.9, 1000)
+    assert agent.reference == SAC()
+    assert agent.phases()[1][:3] == (1000, 1000, 32)
