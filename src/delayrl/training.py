@@ -206,12 +206,13 @@ class Session:
                 columns[name] = loop[name]
             replays.append(ring.Replay(**columns))  # type: ignore[arg-type]
             self.stored[i], self.stored_until[i] = dict(checkpoint.pieces), (int(loop["rows"]), int(loop["steps"]))
-            pending.append(Transition(**{name: loop[f"pending.{name}"] for name in Transition._fields}))  # type: ignore[arg-type]
+            kept = {name: loop[f"pending.{name}"] for name in Transition._fields if f"pending.{name}" in loop}
+            pending += [Transition(**kept)] if kept else []  # type: ignore[arg-type]
             self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
             if not np.array_equal(self.actors[i].truth, loop["truth"]):
                 raise DelayRLError(f"{self.env} does not repeat an episode from its seed, so the run cannot be resumed")
         self.learner = self.learner._replace(replay=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays))
-        self.pending = jax.tree.map(lambda *x: np.stack(x), *pending)
+        self.pending = jax.tree.map(lambda *x: np.stack(x), *pending) if pending else None
 
     def save(self, *, complete: bool = False) -> None:
         """Write each seed's checkpoint; of the replay only what is new."""
@@ -232,8 +233,8 @@ class Session:
             self.stored_until[i] = rows, steps
             alive = rows - self.schedule.replay_capacity
             self.stored[i] = {n: d for n, d in self.stored[i].items() if int(n[13:25]) > alive}
-            assert self.pending is not None
-            loop: Arrays = {f"pending.{n}": np.asarray(x[i]) for n, x in self.pending._asdict().items()}
+            pending = {} if self.pending is None else self.pending._asdict()  # there is one where a run was stopped
+            loop: Arrays = {f"pending.{name}": np.asarray(x[i]) for name, x in pending.items()}
             counts = {"rows": rows, "steps": steps, "lost": lost, "episode": actor.episode}
             loop |= {n: np.asarray(x, np.int32) for n, x in counts.items()}
             loop |= {"truth": actor.truth, "actions": np.reshape(actor.actions, (-1, self.spec.action_size))}
@@ -271,16 +272,7 @@ class Session:
                     chosen = self.program.act(self.learner.agent, seen, self.keys, step)
                 else:
                     chosen = None
-                if self.pending is not None:
-                    self.learner, new = self.program.learn(
-                        self.learner,
-                        self.pending,
-                        self._hidden(),
-                        self.keys,
-                        step,
-                        self.program.due(step, schedule),
-                    )
-                    metrics |= new
+                metrics |= self._learn()
                 actions = self._random(step) if chosen is None else np.asarray(chosen)
                 if self.official and self.spec.delay:  # its first action under delay is random
                     first = np.array([[actor.seen.age == 0] for actor in self.actors])
@@ -293,6 +285,7 @@ class Session:
                     speed = (self.step - began_step) / (time.perf_counter() - began)
                     self._log(metrics, speed, trackers)
                 if self.step % schedule.evaluate_every == 0 or self.step == schedule.steps:
+                    metrics |= self._learn()  # what is evaluated has learned from every step before
                     bar.set_postfix_str(self._evaluate(evaluator, trackers))
                     self.save(complete=self.step == schedule.steps)
             if stop.is_set() and self.step < schedule.steps:
@@ -300,6 +293,15 @@ class Session:
                 raise DelayRLError(f"stopped at step {self.step:,}; the same command goes on from there")
         for run in self.runs:
             curve(run.read("rows"), run.path / "curve.png")
+
+    def _learn(self) -> Metrics:
+        """Hand the newest step to the learners, and have them learn what is due. Not waited for."""
+        if self.pending is None:
+            return {}
+        due = self.program.due(self.step, self.schedule)
+        transition, self.pending = self.pending, None
+        self.learner, new = self.program.learn(self.learner, transition, self._hidden(), self.keys, self.step, due)
+        return new
 
     def _random(self, step: int) -> NDArray[np.float32]:
         draws = [np.random.default_rng([seed, RANDOM_ACTIONS, step]) for seed in self.seeds]
