@@ -34,6 +34,8 @@ class Actor:
 
     def step(self, action: NDArray[np.float32]) -> Transition:
         """Act; start the next episode where this one ends."""
+        if not np.isfinite(action).all():
+            raise DelayRLError(f"the policy of seed {self.seed} gives actions that are not finite: training diverged")
         before, age = self.truth, self.seen.age
         obs, reward, terminated, truncated, info = self.env.step(action)
         self.actions.append(action)

@@ -34,7 +34,7 @@ class Option:
             raise DelayRLError(f"{self.name} must be a number; got {value!r}")
         if self.kind is float:
             return float(value)
-        if value != int(value) or value < (0 if self.name == "random_steps" else 1):
+        if value != int(value) or value < 1:
             raise DelayRLError(f"{self.name} must be a whole number above 0; got {value!r}")
         return int(value)
 

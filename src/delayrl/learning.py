@@ -64,7 +64,7 @@ class Program:
 
     def due(self, step: int, schedule: Schedule) -> tuple[int, ...]:
         """The phases that run once `step` steps are stored."""
-        if step <= schedule.random_steps:
+        if step < schedule.random_steps:
             return ()
         return tuple(i for i, phase in enumerate(self.phases) if step % phase.every == 0)
 

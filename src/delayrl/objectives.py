@@ -20,14 +20,14 @@ def soft_target(
     terminated: Bool[Array, "*batch"],
     next_value: Float[Array, "*batch"],
 ) -> Float[Array, "*batch"]:
-    """Y = R + γ^k (1 - terminated) V(s_{t+k}) (VDPO eq. max_pe, with k steps); a time limit is no termination."""
+    """Y = R + γ^k (1 - terminated) V(s_{t+k}) (VDPO eq. 8, with k steps); a time limit is no termination."""
     return reward + discount * jnp.where(terminated, 0, next_value)
 
 
 def soft_value(
     q: Float[Array, "2 *batch"], log_prob: Float[Array, "*batch"], temperature: Float[Array, ""]
 ) -> Float[Array, "*batch"]:
-    """V = min_i Q_i(s, a) - α log π(a|s), a ~ π (SAC). Its negative mean is the actor's loss (VDPO eq. max_pi)."""
+    """V = min_i Q_i(s, a) - α log π(a|s), a ~ π (SAC). Its negative mean is the actor's loss (VDPO eq. 9)."""
     return q.min(0) - temperature * log_prob
 
 

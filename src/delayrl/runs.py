@@ -139,7 +139,7 @@ class Run:
             if final.exists():
                 shutil.rmtree(final)
             draft.rename(final)
-        for old in sorted(home.glob("[0-9]*"))[:-2]:
+        for old in sorted(home.glob("[0-9]*"))[: -1 if complete else -2]:  # the end needs no replay and nothing older
             shutil.rmtree(old, ignore_errors=True)
         if complete:
             shutil.rmtree(self.path / "replay", ignore_errors=True)

@@ -94,9 +94,8 @@ def train(
     check_names(values, base.agent, base.schedule)
     values = (dict(entry.official) if protocol == "official" else {}) | values
     config, schedule = override(base.agent, values), override(base.schedule, values)
-    group = (
-        Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / f"{agent}-{preset}"
-    )
+    kind = f"{agent}-{preset}" if protocol == "corrected" else f"{agent}-{preset}-{protocol}"
+    group = Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / kind
     single_home = group if out is not None else group / f"seed{seed}"
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
@@ -131,11 +130,17 @@ class Session:
         least = 2 * (self.spec.delay + agent.ahead(self.spec)) + 2
         if schedule.replay_capacity < least:
             raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
+        if schedule.random_steps < least:
+            raise DelayRLError(f"random_steps must be at least {least} here; got {schedule.random_steps}")
+        task = self.actors[0].env.spec
+        if task is None or task.max_episode_steps is None:
+            raise DelayRLError(f"{env} has no time limit, so evaluation may never end; register it with one")
         self.template = template(agent, self.spec)  # says what does not fit, before anything is stored
         self.program = compiled(agent, self.spec, agent.ahead(self.spec) if official else 1)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step = 0
-        self.pending: Transition | None = None
+        self.pending: Transition | None = None  # the newest step, which the learners have not been given yet
+        self.chosen: Any = None  # the next actions, where they have been chosen already
         self.stored: list[dict[str, str]] = [{} for _ in seeds]
         self.stored_until = [(0, 0) for _ in seeds]  # rows and steps of the replay that are in its pieces
 
@@ -196,7 +201,7 @@ class Session:
         )
         if checkpoints[0].complete:
             return
-        replays, pending = [], []
+        replays, pending, chosen = [], [], []
         for i, (run, checkpoint) in enumerate(zip(self.runs, checkpoints, strict=True)):
             loop = checkpoint.arrays("loop")
             columns = {name: np.array(column[i]) for name, column in self.learner.replay._asdict().items()}
@@ -208,11 +213,13 @@ class Session:
             self.stored[i], self.stored_until[i] = dict(checkpoint.pieces), (int(loop["rows"]), int(loop["steps"]))
             kept = {name: loop[f"pending.{name}"] for name in Transition._fields if f"pending.{name}" in loop}
             pending += [Transition(**kept)] if kept else []  # type: ignore[arg-type]
+            chosen += [loop["chosen"]] if "chosen" in loop else []
             self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
             if not np.array_equal(self.actors[i].truth, loop["truth"]):
                 raise DelayRLError(f"{self.env} does not repeat an episode from its seed, so the run cannot be resumed")
         self.learner = self.learner._replace(replay=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays))
         self.pending = jax.tree.map(lambda *x: np.stack(x), *pending) if pending else None
+        self.chosen = np.stack(chosen) if chosen else None
 
     def save(self, *, complete: bool = False) -> None:
         """Write each seed's checkpoint; of the replay only what is new."""
@@ -235,6 +242,7 @@ class Session:
             self.stored[i] = {n: d for n, d in self.stored[i].items() if int(n[13:25]) > alive}
             pending = {} if self.pending is None else self.pending._asdict()  # there is one where a run was stopped
             loop: Arrays = {f"pending.{name}": np.asarray(x[i]) for name, x in pending.items()}
+            loop |= {} if self.chosen is None else {"chosen": np.asarray(self.chosen)[i]}
             counts = {"rows": rows, "steps": steps, "lost": lost, "episode": actor.episode}
             loop |= {n: np.asarray(x, np.int32) for n, x in counts.items()}
             loop |= {"truth": actor.truth, "actions": np.reshape(actor.actions, (-1, self.spec.action_size))}
@@ -266,17 +274,9 @@ class Session:
             ) as bar,
         ):
             while self.step < schedule.steps and not stop.is_set():
-                step = self.step
-                if step > schedule.random_steps:
-                    seen = jax.tree.map(lambda *x: np.stack(x), *[actor.seen for actor in self.actors])
-                    chosen = self.program.act(self.learner.agent, seen, self.keys, step)
-                else:
-                    chosen = None
+                self._choose()
                 metrics |= self._learn()
-                actions = self._random(step) if chosen is None else np.asarray(chosen)
-                if self.official and self.spec.delay:  # its first action under delay is random
-                    first = np.array([[actor.seen.age == 0] for actor in self.actors])
-                    actions = np.where(first, self._random(step), actions)
+                actions, self.chosen = np.asarray(self.chosen), None
                 steps = [actor.step(action) for actor, action in zip(self.actors, actions, strict=True)]
                 self.pending = jax.tree.map(lambda *x: np.stack(x), *steps)
                 self.step += 1
@@ -285,6 +285,7 @@ class Session:
                     speed = (self.step - began_step) / (time.perf_counter() - began)
                     self._log(metrics, speed, trackers)
                 if self.step % schedule.evaluate_every == 0 or self.step == schedule.steps:
+                    self._choose()  # as without an evaluation
                     metrics |= self._learn()  # what is evaluated has learned from every step before
                     bar.set_postfix_str(self._evaluate(evaluator, trackers))
                     self.save(complete=self.step == schedule.steps)
@@ -293,6 +294,19 @@ class Session:
                 raise DelayRLError(f"stopped at step {self.step:,}; the same command goes on from there")
         for run in self.runs:
             curve(run.read("rows"), run.path / "curve.png")
+
+    def _choose(self) -> None:
+        """Have the next actions chosen, by what was learned until now. Not waited for."""
+        if self.chosen is not None:
+            return
+        if self.step < self.schedule.random_steps:
+            self.chosen = self._random()
+            return
+        seen = jax.tree.map(lambda *x: np.stack(x), *[actor.seen for actor in self.actors])
+        self.chosen = self.program.act(self.learner.agent, seen, self.keys, self.step)
+        if self.official and self.spec.delay:  # its first action under delay is random
+            first = np.array([[actor.seen.age == 0] for actor in self.actors])
+            self.chosen = np.where(first, self._random(), self.chosen)
 
     def _learn(self) -> Metrics:
         """Hand the newest step to the learners, and have them learn what is due. Not waited for."""
@@ -303,8 +317,8 @@ class Session:
         self.learner, new = self.program.learn(self.learner, transition, self._hidden(), self.keys, self.step, due)
         return new
 
-    def _random(self, step: int) -> NDArray[np.float32]:
-        draws = [np.random.default_rng([seed, RANDOM_ACTIONS, step]) for seed in self.seeds]
+    def _random(self) -> NDArray[np.float32]:
+        draws = [np.random.default_rng([seed, RANDOM_ACTIONS, self.step]) for seed in self.seeds]
         return np.stack([draw.uniform(-1, 1, self.spec.action_size).astype(np.float32) for draw in draws])
 
     def _hidden(self) -> NDArray[np.int32]:

@@ -79,7 +79,7 @@ class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], N
         self._step = self._newest = self._memory = 0
         self._observations.append(np.array(truth))
         self._arrivals.append(0)
-        return self._show(truth, info)
+        return self._show(info)
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
         """Act now; see what has arrived by the next step."""
@@ -89,10 +89,10 @@ class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], N
         self._observations.append(np.array(truth))
         self._arrivals.append(self._step + travel)
         self._actions.append(np.array(action, self.action_space.dtype))
-        obs, info = self._show(truth, info)
+        obs, info = self._show(info)
         return obs, reward, terminated, truncated, info
 
-    def _show(self, truth: NDArray[Any], info: Info) -> tuple[NDArray[Any], Info]:
+    def _show(self, info: Info) -> tuple[NDArray[Any], Info]:
         first = self._step - len(self._observations) + 1
         arrived = [first + i for i, arrival in enumerate(self._arrivals) if arrival <= self._step]
         self._newest = max([self._newest, *arrived])
@@ -101,7 +101,12 @@ class DelayedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], N
         if age:
             actions[:age] = list(self._actions)[-age:]
         shown = self._observations[self._newest - first].copy()
-        late = {"age": age, "actions": actions, "mask": np.arange(self.law.maximum) < age, "truth": truth}
+        late = {
+            "age": age,
+            "actions": actions,
+            "mask": np.arange(self.law.maximum) < age,
+            "truth": self._observations[-1].copy(),
+        }
         return shown, {**info, **late}
 
 
@@ -128,8 +133,8 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
             # a slot without an action holds zeros, which the action's own bounds need not contain
             low, high = np.minimum(actions.low, 0), np.maximum(actions.high, 0)
             self.observation_space = Box(
-                np.concatenate([observations.low, np.tile(low, self._delay), [0.0]]),
-                np.concatenate([observations.high, np.tile(high, self._delay), [1.0]]),
+                np.concatenate([observations.low, np.tile(low, self._delay), [0.0]]).astype(observations.dtype),
+                np.concatenate([observations.high, np.tile(high, self._delay), [1.0]]).astype(observations.dtype),
                 dtype=observations.dtype.type,  # type: ignore[arg-type, union-attr]
             )
 

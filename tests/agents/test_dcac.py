@@ -185,7 +185,7 @@ def test_gradients() -> None:
 
     def gradient(agent: DCAC, critic):
         loss = functools.partial(agent.loss, target=state.target, windows=windows, key=jax.random.key(5))
-        return jax.grad(lambda params: loss(params)[0])((state.actor, critic))
+        return jax.jit(jax.grad(lambda params: loss(params)[0]))((state.actor, critic))
 
     def size(tree) -> float:
         return float(sum(jnp.abs(x).sum() for x in jax.tree.leaves(tree)))
@@ -247,28 +247,25 @@ def test_act() -> None:
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
 
 
-def test_learning_under_the_loop() -> None:
-    """What has not arrived may be anything; and two seeds beside each other learn what each learns alone."""
-    data = [record("Reacher-v5", 3, 40, seed)[0] for seed in range(2)]
+def test_learning_never_peeks() -> None:
+    """In the loop: what has not arrived may be anything, the learner ends with the same parameters."""
+    data, _ = record("Reacher-v5", 3, 40)
     program = Program(AGENT, Spec(10, 2, 3))
+    keys = jax.vmap(jax.random.key)(jnp.arange(1))
 
-    def run(seeds: list[int], poison: bool = False):
-        keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+    def run(poison: bool):
         learner = program.init(keys, 100)
-        for step in range(1, 41):
-            batch = jax.tree.map(lambda *x: np.stack(x), *[data[s][step - 1] for s in seeds])
+        for step, transition in enumerate(data, 1):
             if poison and step > 37:  # s_38, s_39, s_40 have not arrived
-                bad = {"next_obs": np.full_like(batch.next_obs, 1e6), "reward": np.full_like(batch.reward, -1e6)}
-                batch = batch._replace(**bad, **({"obs": bad["next_obs"]} if step > 38 else {}))
+                bad = {"next_obs": np.full_like(transition.next_obs, 1e6), "reward": np.float32(-1e6)}
+                transition = transition._replace(**bad, **({"obs": bad["next_obs"]} if step > 38 else {}))
+            batch = jax.tree.map(lambda x: np.asarray(x)[None], transition)
             due = (0,) if step == 40 else ()
-            learner, metrics = program.learn(learner, batch, np.full(len(seeds), 3, np.int32), keys, step, due)
+            learner, metrics = program.learn(learner, batch, np.full(1, 3, np.int32), keys, step, due)
         assert all(np.isfinite(x).all() for x in metrics.values())
         return jax.device_get(learner.agent)
 
-    together, alone = run([0, 1]), run([1])
-    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_allclose(a[1], b[0], rtol=1e-4, atol=1e-5)
-    for a, b in zip(jax.tree.leaves(run([1], poison=True)), jax.tree.leaves(alone), strict=True):
+    for a, b in zip(jax.tree.leaves(run(False)), jax.tree.leaves(run(True)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

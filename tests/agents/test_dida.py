@@ -19,7 +19,11 @@ from delayrl.types import Seen, Spec, Window
 from delayrl.views import network_input, view
 
 AGENT = DIDA(
-    SAC(hidden=(16, 16), batch_size=16), expert_steps=20, round_steps=10, imitation_updates=3, student_hidden=(8, 8)
+    SAC(hidden=(16, 16), batch_size=16, actor_updates=1),
+    expert_steps=20,
+    round_steps=10,
+    imitation_updates=3,
+    student_hidden=(8, 8),
 )
 SPEC = Spec(10, 2, 3)
 
@@ -136,31 +140,29 @@ def test_it_asks_for_what_it_needs() -> None:
 
 
 def test_under_the_loop() -> None:
-    """The phases in order; the first imitation comes before the student acts; seeds in lockstep are seeds alone."""
+    """The phases in order; the first imitation comes before the student acts; the same twice; seeds side by side."""
     data = [record("Reacher-v5", 3, 31, seed)[0] for seed in range(2)]
     program = Program(AGENT, SPEC)
 
-    def run(seeds: list[int]) -> list:
-        keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+    def run() -> list:
+        keys = jax.vmap(jax.random.key)(jnp.arange(2))
         learner, states = program.init(keys, 100), []
         for step in range(1, 32):
             due = tuple(i for i, p in enumerate(program.phases) if step > 8 and step % p.every == 0)
-            batch = jax.tree.map(lambda *x: np.stack(x), *[data[s][step - 1] for s in seeds])
-            learner, metrics = program.learn(learner, batch, np.zeros(len(seeds), np.int32), keys, step, due)
+            batch = jax.tree.map(lambda *x: np.stack(x), *[steps[step - 1] for steps in data])
+            learner, metrics = program.learn(learner, batch, np.zeros(2, np.int32), keys, step, due)
             assert all(np.isfinite(x).all() for x in metrics.values())
             states.append(jax.device_get(learner.agent))
         return states
 
-    states = run([0, 1])
+    states = run()
     for step in range(1, 32):
         assert list(states[step - 1].steps) == [step if step > 8 else 0] * 2
     learned = [step for step in range(2, 32) if not same(states[step - 1].student, states[step - 2].student)]
     assert learned == [20, 30]
     improved = [step for step in range(2, 32) if not same(states[step - 1].reference, states[step - 2].reference)]
     assert improved == list(range(9, 21))
-    for a, b in zip(jax.tree.leaves(states[-1]), jax.tree.leaves(run([1])[-1]), strict=True):
-        np.testing.assert_allclose(a[1], b[0], rtol=1e-4, atol=1e-5)
-    assert same(states[-1], run([0, 1])[-1])
+    assert same(states[-1], run()[-1])
 
 
 def test_defaults_are_the_released_codes() -> None:

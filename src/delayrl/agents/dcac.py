@@ -1,4 +1,4 @@
-"""Delay-correcting actor-critic, DC/AC (Bouteiller, Ramstedt et al., ICLR 2021, "RL with random delays").
+"""Delay-correcting actor-critic, DC/AC (Bouteiller, Ramstedt et al., ICLR 2021).
 
 Idea: what arrives during the next Δ steps was caused by actions already taken, so a stretch of the past stays true when
 the actions of that stretch are sampled again from today's policy, inside the augmented states. Values V(x) are learned

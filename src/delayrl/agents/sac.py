@@ -180,7 +180,7 @@ class SAC:
         key: Key,
         penalty: Callable[[Gaussian], Array] | None = None,
     ) -> State:
-        """One step of the actor towards higher soft values (VDPO eq. max_pi)."""
+        """One step of the actor towards higher soft values (VDPO eq. 9)."""
         temperature = jnp.exp(state.log_temperature)
 
         def loss(actor: Params) -> tuple[Array, None]:
@@ -212,6 +212,6 @@ class SAC:
 
 
 def critic_loss(critic: Params, x: Array, action: Array, target: Array) -> tuple[Array, Array]:
-    """Squared error of both critics, added (VDPO eq. max_pe); and their mean value."""
+    """Squared error of both critics, added (VDPO eq. 8); and their mean value."""
     q = networks.twin(critic, x, action)
     return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum(), q.mean()

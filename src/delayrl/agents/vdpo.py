@@ -82,8 +82,9 @@ class VDPO:
 
     def phases(self) -> tuple[Phase, ...]:
         """Reference and belief at every step; now and then many KL updates."""
-        batch = self.reference.batch_size
-        return Phase(1, 1, batch, self.update), Phase(self.clone_every, self.clone_updates, batch, self.clone)
+        learn, *_ = self.reference.phases()
+        clone = Phase(self.clone_every, self.clone_updates, self.reference.batch_size, self.clone)
+        return learn._replace(update=self.update), clone
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
         """The delay-free SAC that is cloned."""
@@ -137,7 +138,7 @@ class VDPO:
         return jnp.where(q_reference < q_delayed, reference, delayed)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """(A) SAC's update of the reference; and of encoder and belief decoder (eq. min_rec), on the same batch."""
+        """(A) SAC's update of the reference; and of encoder and belief decoder (eq. 10), on the same batch."""
         sac_key, dropout_key = jax.random.split(key)
         reference, metrics = self.reference.update(state.reference, windows, sac_key, count)
         state = state._replace(reference=reference)
@@ -154,7 +155,7 @@ class VDPO:
         return state._replace(encoder=encoder, decoder=decoder, belief_memory=memory), metrics | {"belief_loss": loss}
 
     def clone(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """(B) One KL update of the policy head towards the reference (eq. min_kl); the encoder stays where it is."""
+        """(B) One KL update of the policy head towards the reference (eq. 11); the encoder stays where it is."""
         cloned, memory, loss, _ = descend(
             optax.adam(self.learning_rate),
             self.clone_loss,
@@ -183,13 +184,13 @@ class VDPO:
         return jnp.concatenate([repeated, until.reshape(*batch, delay, delay * size), ages], -1)
 
     def belief_loss(self, params: tuple[Params, Params], x: Unseen, key: Key) -> tuple[Array, None]:
-        """Mean squared error of the reconstructed states (eq. min_rec)."""
+        """Mean squared error of the reconstructed states (eq. 10)."""
         encoder, decoder = params
         states = networks.linear(decoder, self.encode(encoder, x.obs, x.actions, key))
         return masked_mean(((states - x.states) ** 2).mean(-1), x.mask), None
 
     def clone_loss(self, cloned: Params, state: State, x: Unseen, key: Key) -> tuple[Array, None]:
-        """KL between the delayed policy at each age and the reference at the state that it cannot see (eq. min_kl)."""
+        """KL between the delayed policy at each age and the reference at the state that it cannot see (eq. 11)."""
         delayed = self.policy(self._with_cloned(state, cloned), x.obs, x.actions, key)
         reference = self.reference.policy(state.reference.actor, x.states)
         pair = (delayed, reference) if self.direction == "reverse" else (reference, delayed)
