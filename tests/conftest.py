@@ -14,6 +14,8 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 from delayrl.acting import Actor  # noqa: E402
+from delayrl.agents.dcac import DCAC  # noqa: E402
+from delayrl.agents.dida import DIDA  # noqa: E402
 from delayrl.agents.sac import SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.envs import make  # noqa: E402
@@ -23,6 +25,8 @@ TINY = {
     "sac-memoryless": SAC(actor_sees="delayed", critic_sees="delayed", hidden=(16, 16), batch_size=16),
     "a-sac": SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16),
     "bpql": SAC(actor_sees="augmented", critic_sees="current", hidden=(16, 16), batch_size=16),
+    "dcac": DCAC(hidden=(16, 16), batch_size=16),
+    "dida": DIDA(TINY_SAC, expert_steps=110, round_steps=10, imitation_updates=3, student_hidden=(8, 8)),
     "vdpo": VDPO(TINY_SAC, width=8, layers=2, clone_every=10, clone_updates=3),
 }
 

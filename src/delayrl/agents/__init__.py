@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 from delayrl.agents.base import Entry, Preset, Schedule
+from delayrl.agents.dcac import DCAC
+from delayrl.agents.dida import DIDA
 from delayrl.agents.random import Random
 from delayrl.agents.sac import SAC
 from delayrl.agents.vdpo import VDPO
@@ -21,12 +23,23 @@ def _soft(summary: str, paper: str, **sees: str) -> Entry:
 
 
 _small_vdpo = VDPO(SAC(batch_size=128), width=64, layers=2, dropout=0.0, clone_every=250, clone_updates=250)
+_small_dida = DIDA(SAC(batch_size=128), expert_steps=10_000, round_steps=250, imitation_updates=250)
 
 AGENTS: dict[str, Entry] = {
     "vdpo": Entry(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
         {"paper": Preset(VDPO(), _PAPER), "small": Preset(_small_vdpo, _SMALL)},
+    ),
+    "dida": Entry(
+        "a student on x_t imitates a delay-free SAC expert (DAgger); the expert's steps are counted",
+        "Liotet et al., ICML 2022",
+        {"paper": Preset(DIDA(), _PAPER), "small": Preset(_small_dida, _SMALL)},
+    ),
+    "dcac": Entry(
+        "learns values on past stretches whose actions are sampled again inside the augmented state",
+        "Bouteiller, Ramstedt et al., ICLR 2021",
+        {"paper": Preset(DCAC(), replace(_PAPER, random_steps=10_000)), "small": Preset(DCAC(), _SMALL)},
     ),
     "bpql": _soft(
         "SAC whose actor sees x_t and whose critic sees s_t",
