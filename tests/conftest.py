@@ -1,6 +1,7 @@
 """Shapes in annotations are checked while the tests run; compiled code is not optimised, which halves their time."""
 
 import os
+from dataclasses import replace
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
@@ -14,8 +15,10 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 from delayrl.acting import Actor  # noqa: E402
+from delayrl.agents.adsac import ADSAC  # noqa: E402
 from delayrl.agents.dcac import DCAC  # noqa: E402
 from delayrl.agents.dida import DIDA  # noqa: E402
+from delayrl.agents.lifting import BPQL, Lifting  # noqa: E402
 from delayrl.agents.sac import SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.envs import make  # noqa: E402
@@ -25,6 +28,8 @@ TINY = {
     "sac-memoryless": SAC(actor_sees="delayed", critic_sees="delayed", hidden=(16, 16), batch_size=16),
     "a-sac": SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16),
     "bpql": SAC(actor_sees="augmented", critic_sees="current", hidden=(16, 16), batch_size=16),
+    "lifting": Lifting(replace(BPQL, hidden=(16, 16), batch_size=16, update_every=10, updates=10)),
+    "ad-sac": ADSAC(SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16)),
     "dcac": DCAC(hidden=(16, 16), batch_size=16),
     "dida": DIDA(TINY_SAC, expert_steps=110, round_steps=10, imitation_updates=3, student_hidden=(8, 8)),
     "vdpo": VDPO(TINY_SAC, width=8, layers=2, clone_every=10, clone_updates=3),

@@ -20,7 +20,7 @@ from delayrl.types import Seen, Spec, Transition, Window
 from delayrl.views import view
 
 ENV, OBS, ACT = "Reacher-v5", 10, 2
-DELAYED = ["sac-memoryless", "a-sac", "bpql", "dcac", "dida", "vdpo"]
+DELAYED = ["sac-memoryless", "a-sac", "bpql", "lifting", "ad-sac", "dcac", "dida", "vdpo"]
 PRIVILEGED = {name for name in DELAYED if TINY[name].privileged}
 
 

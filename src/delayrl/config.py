@@ -34,8 +34,9 @@ class Option:
             raise DelayRLError(f"{self.name} must be a number; got {value!r}")
         if self.kind is float:
             return float(value)
-        if value != int(value) or value < 1:
-            raise DelayRLError(f"{self.name} must be a whole number above 0; got {value!r}")
+        least = 0 if self.default == 0 else 1
+        if value != int(value) or value < least:
+            raise DelayRLError(f"{self.name} must be a whole number, at least {least}; got {value!r}")
         return int(value)
 
 

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+from delayrl.agents.adsac import ADSAC
 from delayrl.agents.base import Entry, Preset, Schedule
 from delayrl.agents.dcac import DCAC
 from delayrl.agents.dida import DIDA
+from delayrl.agents.lifting import BPQL, Lifting
 from delayrl.agents.random import Random
 from delayrl.agents.sac import SAC
 from delayrl.agents.vdpo import VDPO
@@ -22,7 +24,11 @@ def _soft(summary: str, paper: str, **sees: str) -> Entry:
     return Entry(summary, paper, presets)
 
 
-_small_vdpo = VDPO(SAC(batch_size=128), width=64, layers=2, dropout=0.0, clone_every=250, clone_updates=250)
+_small_vdpo = VDPO(
+    SAC(batch_size=128), width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250
+)
+_small_adsac = ADSAC(SAC(actor_sees="augmented", critic_sees="augmented", batch_size=128))
+_small_lifting = Lifting(replace(BPQL, batch_size=128), lifting_hold=3_750, lifting_end=11_250)
 _small_dida = DIDA(SAC(batch_size=128), expert_steps=10_000, round_steps=250, imitation_updates=250)
 
 AGENTS: dict[str, Entry] = {
@@ -30,6 +36,16 @@ AGENTS: dict[str, Entry] = {
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
         {"paper": Preset(VDPO(), _PAPER), "small": Preset(_small_vdpo, _SMALL)},
+    ),
+    "lifting": Entry(
+        "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
+        "Lee et al., 2026, arXiv 2604.03641",
+        {"paper": Preset(Lifting(), replace(_PAPER, random_steps=10_000)), "small": Preset(_small_lifting, _SMALL)},
+    ),
+    "ad-sac": Entry(
+        "learns values for a shorter delay, and improves the actor of the long one by them",
+        "Wu et al., ICML 2024",
+        {"paper": Preset(ADSAC(), _PAPER), "small": Preset(_small_adsac, _SMALL)},
     ),
     "dida": Entry(
         "a student on x_t imitates a delay-free SAC expert (DAgger); the expert's steps are counted",
