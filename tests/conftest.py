@@ -18,8 +18,8 @@ from delayrl.acting import Actor  # noqa: E402
 from delayrl.agents.adsac import ADSAC  # noqa: E402
 from delayrl.agents.dcac import DCAC  # noqa: E402
 from delayrl.agents.dida import DIDA  # noqa: E402
-from delayrl.agents.lifting import BPQL, Lifting  # noqa: E402
-from delayrl.agents.sac import SAC  # noqa: E402
+from delayrl.agents.lifting import Lifting  # noqa: E402
+from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.envs import make  # noqa: E402
 

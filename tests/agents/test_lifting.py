@@ -13,7 +13,8 @@ from conftest import record
 from delayrl import networks
 from delayrl import replay as ring
 from delayrl.agents import lifting
-from delayrl.agents.lifting import BPQL, Lifting, lifting_loss, moments
+from delayrl.agents.lifting import Lifting, lifting_loss, moments
+from delayrl.agents.sac import BPQL
 from delayrl.errors import DelayRLError
 from delayrl.learning import compiled
 from delayrl.networks import Gaussian

@@ -6,9 +6,9 @@ from delayrl.agents.adsac import ADSAC
 from delayrl.agents.base import Entry, Preset, Schedule
 from delayrl.agents.dcac import DCAC
 from delayrl.agents.dida import DIDA
-from delayrl.agents.lifting import BPQL, Lifting
+from delayrl.agents.lifting import Lifting
 from delayrl.agents.random import Random
-from delayrl.agents.sac import SAC
+from delayrl.agents.sac import BPQL, SAC
 from delayrl.agents.vdpo import VDPO
 
 _PAPER = Schedule()
@@ -28,7 +28,7 @@ _small_vdpo = VDPO(
     SAC(batch_size=128), width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250
 )
 _small_adsac = ADSAC(SAC(actor_sees="augmented", critic_sees="augmented", batch_size=128))
-_small_lifting = Lifting(replace(BPQL, batch_size=128), lifting_hold=3_750, lifting_end=11_250)
+_small_lifting = Lifting(SAC(actor_sees="augmented", batch_size=128), lifting_hold=3_750, lifting_end=11_250)
 _small_dida = DIDA(SAC(batch_size=128), expert_steps=10_000, round_steps=250, imitation_updates=250)
 
 AGENTS: dict[str, Entry] = {
@@ -57,11 +57,13 @@ AGENTS: dict[str, Entry] = {
         "Bouteiller, Ramstedt et al., ICLR 2021",
         {"paper": Preset(DCAC(), replace(_PAPER, random_steps=10_000)), "small": Preset(DCAC(), _SMALL)},
     ),
-    "bpql": _soft(
+    "bpql": Entry(
         "SAC whose actor sees x_t and whose critic sees s_t",
         "Kim et al., NeurIPS 2023",
-        actor_sees="augmented",
-        critic_sees="current",
+        {
+            "paper": Preset(BPQL, replace(_PAPER, random_steps=10_000)),
+            "small": Preset(SAC(actor_sees="augmented", batch_size=128), _SMALL),
+        },
     ),
     "a-sac": _soft(
         "SAC on the augmented state x_t = (last observation, actions since)",

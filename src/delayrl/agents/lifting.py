@@ -13,7 +13,7 @@ and every log-std in [-20, 2]; 100 samples are off by 1e-1.
 Deviations from the paper and from the released code are numbered in docs/algorithms/lifting.md.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -32,23 +32,6 @@ NODES, SPAN = 64, 4.5
 exact than Gauss-Hermite's nodes, which lie wider apart where the mass is (2e-2 with as many)."""
 
 
-BPQL = sac.SAC(
-    actor_sees="augmented",
-    critic_sees="current",
-    critic_learning_rate=3e-4,
-    temperature_learning_rate=3e-4,
-    initial_temperature=0.2,
-    n_steps=1,
-    actor_every=1,
-    actor_updates=1,
-    log_std_range=(-20.0, 2.0),
-    log_std_bounds="clip",
-    update_every=50,
-    updates=50,
-)
-"""With the hyperparameters of the released code."""
-
-
 class State(NamedTuple):
     """BPQL, and the delay-free SAC; the latter's temperature is BPQL's."""
 
@@ -60,7 +43,7 @@ class State(NamedTuple):
 class Lifting:
     """Hyperparameters; the defaults are the released code's."""
 
-    bpql: sac.SAC = BPQL
+    bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, initial_temperature=0.2))
     lifting_weight: Annotated[float, "weight of the lifting loss at first"] = 10.0
     lifting_hold: Annotated[int, "environment step up to which it keeps that weight"] = 250_000
     lifting_end: Annotated[int, "environment step at which the weight has gone linearly to 0"] = 750_000

@@ -215,3 +215,19 @@ def critic_loss(critic: Params, x: Array, action: Array, target: Array) -> tuple
     """Squared error of both critics, added (VDPO eq. 8); and their mean value."""
     q = networks.twin(critic, x, action)
     return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum(), q.mean()
+
+
+BPQL = SAC(
+    actor_sees="augmented",
+    critic_sees="current",
+    critic_learning_rate=3e-4,
+    temperature_learning_rate=3e-4,
+    n_steps=1,
+    actor_every=1,
+    actor_updates=1,
+    log_std_range=(-20.0, 2.0),
+    log_std_bounds="clip",
+    update_every=50,
+    updates=50,
+)
+"""The hyperparameters of BPQL's released code."""
