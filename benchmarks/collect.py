@@ -14,23 +14,28 @@ from delayrl.runs import Run
 KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
 
 
+def collect(out: Path, runs: list[Path], episodes: int = 0) -> None:
+    """Write the rows of run folders into one file."""
+    lines = []
+    for number, path in enumerate(runs):
+        run = Run(path)
+        metrics = run.read("metrics")
+        speed = metrics[-1]["steps_per_second"] if metrics else None
+        lines.append({"run": number, "config": run.config, "steps_per_second": speed})
+        lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.read("rows")]
+        if episodes:
+            lines.append({"run": number, "evaluation": evaluate(path, episodes)})
+    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
 def main() -> None:
-    """Read run folders, write rows."""
+    """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--episodes", type=int, default=0, help="also evaluate each run on so many unseen start states")
     given = parser.parse_args()
-    with open(given.out, "w") as file:
-        for number, path in enumerate(given.runs):
-            run = Run(path)
-            metrics = run.read("metrics")
-            speed = metrics[-1]["steps_per_second"] if metrics else None
-            print(json.dumps({"run": number, "config": run.config, "steps_per_second": speed}), file=file)
-            for row in run.read("rows"):
-                print(json.dumps({"run": number} | {name: row[name] for name in KEPT}), file=file)
-            if given.episodes:
-                print(json.dumps({"run": number, "evaluation": evaluate(path, given.episodes)}), file=file)
+    collect(given.out, given.runs, given.episodes)
 
 
 if __name__ == "__main__":

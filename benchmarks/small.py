@@ -1,0 +1,50 @@
+"""Every agent on small tasks, three seeds in lockstep: `python benchmarks/small.py TASK [AGENT …]`.
+
+Runs land below runs/small/TASK (the same command resumes); when all have ended, their rows are collected into
+benchmarks/results/TASK.jsonl, with 20 episodes on start states that no run saw.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from collect import collect
+
+import delayrl
+from delayrl.agents import AGENTS
+
+SMALL_NETWORKS = {"hidden": [64, 64], "batch_size": 64}
+TASKS: dict[str, dict[str, Any]] = {
+    "pendulum": {"env": "InvertedPendulum-v5", "delay": 5},
+    "reacher": {"env": "Reacher-v5", "delay": 5, "steps": 10_000, "evaluate_every": 2_000},
+    "walk": {"env": "delayrl/Walk-v0", "delay": 4, "steps": 6_000, "evaluate_every": 1_000},
+}
+OWN: dict[tuple[str, str], dict[str, Any]] = {
+    ("reacher", "dida"): {"expert_steps": 7_000},
+    ("walk", "dida"): {"expert_steps": 4_000, "hidden": [64, 64]},
+    ("reacher", "lifting"): {"lifting_hold": 2_500, "lifting_end": 7_500},
+    ("walk", "lifting"): {"lifting_hold": 1_500, "lifting_end": 4_500},
+    ("walk", "vdpo"): {"width": 32, "layers": 1},
+}
+
+
+def main() -> None:
+    """Train and collect."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("task", choices=list(TASKS))
+    parser.add_argument("agents", nargs="*", default=list(AGENTS))
+    given = parser.parse_args()
+    options = TASKS[given.task]
+    runs = []
+    for agent in given.agents:
+        networks = SMALL_NETWORKS if given.task == "walk" and agent != "random" else {}
+        values = options | networks | OWN.get((given.task, agent), {}) | ({"delay": 0} if agent == "sac" else {})
+        out = Path("runs/small") / given.task / agent
+        trained = delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
+        runs += [run.path for run in trained]
+        print(f"{agent}: done", flush=True)
+    collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", runs, episodes=20)
+
+
+if __name__ == "__main__":
+    main()
