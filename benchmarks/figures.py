@@ -64,35 +64,82 @@ def draw(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
     pyplot.close(figure)
 
 
+def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any]]]]:
+    """(configuration, evaluation on unseen start states) of each run, by agent."""
+    configs, _, lines = read(name)
+    result: dict[str, list[tuple[dict[str, Any], dict[str, Any]]]] = defaultdict(list)
+    for line in lines:
+        result[line["evaluation"]["agent"]].append((configs[line["run"]], line["evaluation"]))
+    return result
+
+
 def table(name: str) -> str:
-    """Markdown: the evaluation of each run on start states that it never saw."""
-    configs, _, evaluations = read(name)
-    lines = [
-        "| agent | delay | seed | steps | mean return | std | episodes |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for line in evaluations:
-        config, e = configs[line["run"]], line["evaluation"]
-        cells = [e["agent"], e["delay"], config["seed"], config["schedule"]["steps"]]
-        lines.append(
-            f"| {' | '.join(map(str, cells))} | {e['mean_return']:.1f} | {e['std_return']:.1f} | {e['episodes']} |"
-        )
+    """Markdown: each agent's returns on start states that it never saw, seed by seed, and between its anchors."""
+    found = evaluations(name)
+    means = {agent: [e["mean_return"] for _, e in runs] for agent, runs in found.items()}
+    anchors = "sac" in means and "random" in means
+    lines = ["| agent | delay | steps | mean return | each seed |" + (" normalised |" if anchors else "")]
+    lines.append("| --- | --- | --- | --- | --- |" + (" --- |" if anchors else ""))
+    for agent, runs in sorted(found.items(), key=lambda item: -np.mean(means[item[0]])):
+        config, evaluation = runs[0]
+        seeds = " · ".join(f"{mean:.1f}" for mean in means[agent])
+        cells = [
+            f"`{agent}`",
+            evaluation["delay"],
+            f"{config['schedule']['steps']:,}",
+            f"{np.mean(means[agent]):.1f}",
+            seeds,
+        ]
+        if anchors:
+            low, high = np.mean(means["random"]), np.mean(means["sac"])
+            cells.append(f"{(np.mean(means[agent]) - low) / (high - low):.2f}")
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
+
+
+def provenance(name: str) -> str:
+    """One line: on what the rows were made."""
+    configs, _, lines = read(name)
+    versions = configs[0]["versions"]
+    commits = sorted({config["versions"]["commit"] or "?" for config in configs.values()})
+    episodes = lines[0]["evaluation"]["episodes"] if lines else 0
+    return (
+        f"Each return is the mean of {episodes} episodes on start states that the run never saw, raw; protocol "
+        f"`{configs[0]['protocol']}`, preset `{configs[0]['preset']}`; {versions['cores']} x86 cores, "
+        f"jax {versions['jax']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, "
+        f"commit {', '.join(commits)}. "
+        f"Rows: `benchmarks/results/{name}.jsonl`."
+    )
+
+
+def insert(page: Path, key: str, text: str) -> None:
+    """Put generated text between `<!-- key -->` and `<!-- /key -->`."""
+    content = page.read_text()
+    begin, end = f"<!-- {key} -->", f"<!-- /{key} -->"
+    head, rest = content.split(begin)
+    page.write_text(head + begin + "\n" + text + "\n" + end + rest.split(end)[1])
 
 
 def main() -> None:
     """Everything that the docs show."""
-    images = HERE.parent / "docs" / "img"
+    root = HERE.parent
+    images = root / "docs" / "img"
+    late = "delay 5"
     words = {
-        "vdpo": "VDPO, delay 5",
+        "vdpo": f"VDPO, {late}",
         "reference": "its reference, no delay",
-        "sac-memoryless": "SAC without memory, delay 5",
+        "sac-memoryless": f"SAC without memory, {late}",
     }
-    title = "InvertedPendulum-v5, three seeds"
-    draw("inverted-pendulum", title, images / "return-against-steps.png", words)
-    print(table("inverted-pendulum"), "\n")
-    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | {"bpql": "BPQL, delay 5"})
-    print(table("reacher"))
+    draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", words)
+    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | {"bpql": f"BPQL, {late}"})
+    for name, pages in {
+        "pendulum": ["README.md", "docs/algorithms/vdpo.md", "docs/benchmarks.md"],
+        "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
+        "walk": ["docs/benchmarks.md"],
+    }.items():
+        if (HERE / "results" / f"{name}.jsonl").exists():
+            for page in pages:
+                insert(root / page, name, table(name) + "\n\n" + provenance(name))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Every agent on small tasks, three seeds in lockstep: `python benchmarks/small.py TASK [AGENT …]`.
 
-Runs land below runs/small/TASK (the same command resumes); when all have ended, their rows are collected into
-benchmarks/results/TASK.jsonl, with 20 episodes on start states that no run saw.
+Runs land below runs/small/TASK (the same command resumes); then the rows of all that are complete there are collected
+into benchmarks/results/TASK.jsonl, with 20 episodes on start states that the run never saw.
 """
 
 import argparse
@@ -12,6 +12,7 @@ from collect import collect
 
 import delayrl
 from delayrl.agents import AGENTS
+from delayrl.runs import Run
 
 SMALL_NETWORKS = {"hidden": [64, 64], "batch_size": 64}
 TASKS: dict[str, dict[str, Any]] = {
@@ -35,15 +36,14 @@ def main() -> None:
     parser.add_argument("agents", nargs="*", default=list(AGENTS))
     given = parser.parse_args()
     options = TASKS[given.task]
-    runs = []
     for agent in given.agents:
         networks = SMALL_NETWORKS if given.task == "walk" and agent != "random" else {}
         values = options | networks | OWN.get((given.task, agent), {}) | ({"delay": 0} if agent == "sac" else {})
         out = Path("runs/small") / given.task / agent
-        trained = delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
-        runs += [run.path for run in trained]
+        delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
         print(f"{agent}: done", flush=True)
-    collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", runs, episodes=20)
+    complete = [path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if Run(path).latest().complete]
+    collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", complete, episodes=20)
 
 
 if __name__ == "__main__":
