@@ -139,10 +139,14 @@ class Run:
             if final.exists():
                 shutil.rmtree(final)
             draft.rename(final)
-        for old in sorted(home.glob("[0-9]*"))[: -1 if complete else -2]:  # the end needs no replay and nothing older
+        for old in sorted(home.glob("[0-9]*"))[:-2]:
             shutil.rmtree(old, ignore_errors=True)
-        if complete:
-            shutil.rmtree(self.path / "replay", ignore_errors=True)
+
+    def finish(self) -> None:
+        """Delete what only a run that goes on needs: the older checkpoint and the replay."""
+        for old in sorted((self.path / "checkpoints").glob("[0-9]*"))[:-1]:
+            shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(self.path / "replay", ignore_errors=True)
 
     def save_piece(self, name: str, arrays: Arrays) -> str:
         """Write one piece of the replay; returns its checksum."""
@@ -153,10 +157,14 @@ class Run:
             draft.rename(self.path / "replay" / name)
         return digest
 
-    def keep_pieces(self, names: set[str]) -> None:
-        """Delete the pieces that no checkpoint needs any more."""
+    def drop_pieces(self) -> None:
+        """Delete the pieces that no checkpoint names any more."""
+        named: set[str] = set()
+        for manifest in (self.path / "checkpoints").glob("[0-9]*/manifest.json"):
+            with contextlib.suppress(ValueError, KeyError):
+                named |= set(json.loads(manifest.read_text())["pieces"])
         for file in (self.path / "replay").glob("*"):
-            if file.name not in names:
+            if file.name not in named:
                 file.unlink(missing_ok=True)
 
 

@@ -167,9 +167,10 @@ class Session:
             note(line)
         common = set.intersection(*({c.step for c in good} for good, _ in found))
         if not common:
-            for (_, broken), run in zip(found, runs, strict=True):
-                if broken:
-                    raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
+            for (good, broken), run in zip(found, runs, strict=True):
+                if good or broken:
+                    what = "no good checkpoint left" if broken else "no checkpoint of the same step as its neighbours"
+                    raise DelayRLError(f"{run.path} has {what}; --overwrite starts afresh")
                 run.rewind(-1)
             return
         step = max(common)
@@ -247,8 +248,9 @@ class Session:
             loop |= {n: np.asarray(x, np.int32) for n, x in counts.items()}
             loop |= {"truth": actor.truth, "actions": np.reshape(actor.actions, (-1, self.spec.action_size))}
             run.save(self.step, mine, {n: np.asarray(x) for n, x in loop.items()}, self.stored[i])
-            good, _ = run.checkpoints()
-            run.keep_pieces({name for c in good for name in c.pieces})
+            run.drop_pieces()
+        for run in self.runs if complete else []:  # once all seeds have their last checkpoint
+            run.finish()
 
     # -- the loop --------------------------------------------------------------------------------------------------
 
@@ -435,9 +437,9 @@ def _cut(replay: ring.Replay, seed: int, first: int, last: int, first_step: int,
     capacity = replay.obs.shape[1]
     index = np.arange(first, last + 1) % capacity
     columns = ("obs", "action", "reward", "age", "terminated", "moment")
-    piece: Arrays = {name: np.asarray(getattr(replay, name)[seed][index]) for name in columns}
+    piece: Arrays = {name: np.asarray(getattr(replay, name)[seed, index]) for name in columns}
     numbers = np.arange(max(first_step, steps - capacity), steps)
-    row_of = np.asarray(replay.row_of[seed])[numbers % capacity]
+    row_of = np.asarray(replay.row_of[seed, numbers % capacity])
     return piece | {"rows": np.arange(first, last + 1), "steps": numbers, "row_of": row_of}
 
 
