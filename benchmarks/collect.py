@@ -25,6 +25,7 @@ def collect(out: Path, runs: list[Path], episodes: int = 0) -> None:
         lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.read("rows")]
         if episodes:
             lines.append({"run": number, "evaluation": evaluate(path, episodes)})
+    out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
