@@ -8,7 +8,15 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 from jaxtyping import install_import_hook
 
 install_import_hook(
-    ["delayrl.networks", "delayrl.objectives", "delayrl.views", "delayrl.replay", "delayrl.agents"], "beartype.beartype"
+    [
+        "delayrl.networks",
+        "delayrl.transformer",
+        "delayrl.objectives",
+        "delayrl.views",
+        "delayrl.replay",
+        "delayrl.agents",
+    ],
+    "beartype.beartype",
 )
 
 import numpy as np  # noqa: E402

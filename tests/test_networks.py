@@ -8,13 +8,14 @@ from scipy import stats
 from scipy.special import erf
 
 from delayrl import networks
+from delayrl.transformer import dropout, transformer, transformer_init
 
 SIZES = {"obs_size": 5, "action_size": 3, "length": 6, "width": 16, "layers": 3}
 
 
 def random_params(seed: int = 0) -> networks.Params:
     """All parameters away from their initial values, so that no term hides."""
-    params = networks.transformer_init(jax.random.key(seed), **SIZES)
+    params = transformer_init(jax.random.key(seed), **SIZES)
     leaves, form = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(seed + 1), len(leaves))
     return jax.tree.unflatten(
@@ -57,7 +58,7 @@ def numpy_transformer(params: networks.Params, obs: np.ndarray, actions: np.ndar
 def test_transformer_equals_numpy(rng: np.random.Generator) -> None:
     params = random_params()
     obs, actions = rng.normal(size=(4, 5)), rng.normal(size=(4, 6, 3))
-    ours = networks.transformer(params, jnp.asarray(obs), jnp.asarray(actions))
+    ours = transformer(params, jnp.asarray(obs), jnp.asarray(actions))
     for i in range(4):
         np.testing.assert_allclose(ours[i], numpy_transformer(params, obs[i], actions[i]), rtol=2e-4, atol=2e-4)
 
@@ -66,26 +67,24 @@ def test_position_sees_only_its_past(rng: np.random.Generator) -> None:
     """Position i depends on every action 0..i and on none after it: padding has no influence."""
     params = random_params()
     obs, actions = jnp.asarray(rng.normal(size=5)), jnp.asarray(rng.normal(size=(6, 3)))
-    slope = jax.jacobian(lambda a: networks.transformer(params, obs, a))(actions)  # [i, width, j, action]
+    slope = jax.jacobian(lambda a: transformer(params, obs, a))(actions)  # [i, width, j, action]
     depends = np.abs(np.asarray(slope)).max((1, 3)) > 1e-6
     np.testing.assert_array_equal(depends, np.tril(np.ones((6, 6), bool)))
-    assert (
-        np.abs(np.asarray(jax.jacobian(lambda o: networks.transformer(params, o, actions))(obs))).max((1, 2)) > 1e-6
-    ).all()
+    assert (np.abs(np.asarray(jax.jacobian(lambda o: transformer(params, o, actions))(obs))).max((1, 2)) > 1e-6).all()
 
 
 def test_dropout_is_off_without_key(rng: np.random.Generator) -> None:
     params = random_params()
     obs, actions = jnp.asarray(rng.normal(size=(2, 5))), jnp.asarray(rng.normal(size=(2, 6, 3)))
-    plain = networks.transformer(params, obs, actions)
-    np.testing.assert_array_equal(networks.transformer(params, obs, actions, 0.5), plain)
-    dropped = networks.transformer(params, obs, actions, 0.5, jax.random.key(0))
+    plain = transformer(params, obs, actions)
+    np.testing.assert_array_equal(transformer(params, obs, actions, 0.5), plain)
+    dropped = transformer(params, obs, actions, 0.5, jax.random.key(0))
     assert np.abs(np.asarray(dropped - plain)).max() > 0.1
 
 
 @pytest.mark.parametrize("rate", [0.1, 0.5])
 def test_dropout_keeps_the_mean(rate: float) -> None:
-    x = networks.dropout(jax.random.key(0), rate, jnp.ones((1000, 1000)))
+    x = dropout(jax.random.key(0), rate, jnp.ones((1000, 1000)))
     assert abs(float((x == 0).mean()) - rate) < 0.002
     assert abs(float(x.mean()) - 1) < 0.005
 
@@ -130,7 +129,7 @@ def test_torch_default_initialisation() -> None:
 
 
 def test_transformer_initialisation() -> None:
-    params = networks.transformer_init(jax.random.key(0), 5, 3, 6, 64, 1)
+    params = transformer_init(jax.random.key(0), 5, 3, 6, 64, 1)
     assert abs(float(params["join"]["w"].std()) - 0.02) < 1e-3
     assert not params["join"]["b"].any()
     assert abs(float(params["blocks"][0]["qkv"]["w"].max()) - (6 / 256) ** 0.5) < 1e-3

@@ -41,11 +41,8 @@ class Actor:
         self.actions.append(action)
         self._see(obs, info)
         reward = float(reward)
-        if not (np.isfinite(reward) and np.isfinite(self.truth).all()):
-            what = "a reward" if not np.isfinite(reward) else "an observation"
-            raise DelayRLError(
-                f"the environment gave {what} that is not finite: step {len(self.actions)}, episode {self.episode}"
-            )
+        if not np.isfinite(reward):
+            self._refuse("a reward")
         done = terminated or truncated
         step = Transition(
             before,  # type: ignore[arg-type]
@@ -74,3 +71,10 @@ class Actor:
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:
         self.seen = seen_now(obs, info, self.env.law.maximum, privileged=self.privileged)
         self.truth = np.asarray(info["truth"], np.float32)
+        if not np.isfinite(self.truth).all():
+            self._refuse("an observation")
+
+    def _refuse(self, what: str) -> None:
+        raise DelayRLError(
+            f"the environment gave {what} that is not finite: step {len(self.actions)}, episode {self.episode}"
+        )

@@ -28,8 +28,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except DelayRLError as error:
         print(f"delayrl: {error}", file=sys.stderr)
         sys.exit(2)
-    except BrokenPipeError:
+    except BrokenPipeError:  # before OSError, which it is
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"delayrl: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
 
@@ -129,7 +132,7 @@ def _train(arguments: list[str]) -> None:
 def _summary(run: Any) -> None:
     """What came out, where it lies, what to type next."""
     rows, config = run.read("rows"), run.config
-    last = max(row["step"] for row in rows)
+    last = max((row["step"] for row in rows), default=0)
     print(f"{config['agent']} on {config['env']}, delay {config['delay']}, seed {config['seed']}: {last:,} steps")
     for policy, label in (
         ("agent", "return under delay" if config["delay"] else "return"),

@@ -17,6 +17,7 @@ class Option:
     kind: Any
     default: Any
     help: str
+    bounds: tuple[float, float] = (-math.inf, math.inf)
 
     def check(self, value: Any) -> Any:
         """The value, in this option's type; DelayRLError where it does not fit."""
@@ -32,6 +33,8 @@ class Option:
             return tuple(Option(self.name, inner[0], None, "").check(item) for item in value)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise DelayRLError(f"{self.name} must be a number; got {value!r}")
+        if not self.bounds[0] <= value <= self.bounds[1]:
+            raise DelayRLError(f"{self.name} must lie in {self.bounds[0]:g} .. {self.bounds[1]:g}; got {value!r}")
         if self.kind is float:
             return float(value)
         least = 0 if self.default == 0 else 1
@@ -48,7 +51,8 @@ def options(config: Any) -> Iterator[Option]:
         if is_dataclass(value):
             yield from options(value)
         elif get_origin(hint) is Annotated and get_args(hint)[1] != "fixed":
-            yield Option(field.name, get_args(hint)[0], value, get_args(hint)[1])
+            kind, words, *bounds = get_args(hint)
+            yield Option(field.name, kind, value, words, *bounds)
 
 
 def override(config: Any, values: Mapping[str, Any]) -> Any:

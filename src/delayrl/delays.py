@@ -49,7 +49,7 @@ class Constant:
         return int(self.steps), memory
 
 
-def as_law(delay: int | DelayLaw) -> DelayLaw:
+def as_law(delay: float | DelayLaw) -> DelayLaw:
     """A law as it is; a number as the constant delay of so many steps.
 
     Raises:

@@ -71,8 +71,10 @@ class Evaluator:
             step += 1
             for i, j in np.argwhere(running):
                 obs, reward, terminated, truncated, info = self._envs[i][j].step(actions[i, j])
-                if not np.isfinite(reward):
-                    raise DelayRLError(f"the environment gave the reward {reward} in evaluation")
+                if not (np.isfinite(reward) and np.isfinite(info["truth"]).all()):
+                    raise DelayRLError(
+                        "the environment gave a reward or an observation that is not finite in evaluation"
+                    )
                 returns[i, j] += float(reward)
                 lengths[i, j] += 1
                 running[i, j] = not (terminated or truncated)
@@ -99,6 +101,12 @@ def _compiled_act(agent: Agent) -> Any:
     return jax.jit(jax.vmap(episodes, (0, 0, 0, None)))
 
 
+def check_seed(seed: int) -> None:
+    """Seeds are whole numbers from 0 to 2³¹ - 1."""
+    if not 0 <= seed < 2**31:
+        raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed}")
+
+
 def reset_seed(seed: int, *stream: int) -> int:
     """A seed for one episode: the same numbers give the same seed, others an unrelated one."""
     return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0] >> 1)
@@ -123,8 +131,9 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | None = None, seed
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
-    if episodes < 1 or seed < 0:
-        raise DelayRLError(f"episodes must be at least 1 and seed no less than 0; got {episodes} and {seed}")
+    if episodes < 1:
+        raise DelayRLError(f"episodes must be at least 1; got {episodes}")
+    check_seed(seed)
     policy, config = load(run), Run(Path(run)).config
     delay = config["delay"] if delay is None else delay
     evaluator = Evaluator(policy.agent, policy.spec, config["env"], delay, 1, episodes)

@@ -35,11 +35,8 @@ class Program:
     def init(self, keys: Key, capacity: int) -> Learner:
         """Fresh states and empty replays."""
         states = jax.jit(jax.vmap(functools.partial(self._agent.init, self._spec)))(keys)
-        replay = jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), ring.init(self._spec, 1))
-        size = {
-            name: (len(keys), capacity, *leaf.shape[2:]) for name, leaf in replay._asdict().items() if leaf.ndim > 1
-        }
-        return Learner(states, replay._replace(**{n: jnp.zeros(s, getattr(replay, n).dtype) for n, s in size.items()}))
+        shapes = jax.eval_shape(lambda: ring.init(self._spec, capacity))
+        return Learner(states, jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), shapes))
 
     def act(self, agent: State, seen: Seen, keys: Key, step: int) -> Action:
         """Exploring actions for all seeds, not waited for."""

@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 from delayrl.errors import DelayRLError
 
 FORMAT = 1
+CONFIG = {"agent": str, "preset": str, "env": str, "delay": int, "hyperparameters": dict, "schedule": dict}
+"""What a configuration must hold, and of which type."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -61,12 +63,14 @@ class Run:
             raise DelayRLError(f"{self.path} is not a run folder: it has no config.json")
         try:
             config = json.loads(file.read_text())
-            assert isinstance(config, dict)
-            if config["format"] != FORMAT:
-                raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
-            return config
-        except (ValueError, KeyError, AssertionError) as error:
+        except (ValueError, OSError) as error:
             raise DelayRLError(f"{file} is damaged: {type(error).__name__}") from error
+        for name, kind in {"format": int, **CONFIG}.items():
+            if not isinstance(config, dict) or not isinstance(config.get(name), kind):
+                raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
+        if config["format"] != FORMAT:
+            raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
+        return config  # type: ignore[no-any-return]
 
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""
@@ -76,10 +80,18 @@ class Run:
 
     def remove(self) -> None:
         """Delete what a run put there, and nothing else."""
-        for name in ("config.json", "rows.jsonl", "metrics.jsonl", "curve.png"):
-            (self.path / name).unlink(missing_ok=True)
-        for name in ("checkpoints", "replay", "tensorboard"):
-            shutil.rmtree(self.path / name, ignore_errors=True)
+        with _disk(self.path):
+            for name in ("checkpoints", "replay", "tensorboard", "wandb"):
+                if (self.path / name).exists():
+                    shutil.rmtree(self.path / name)
+            for name in ("rows.jsonl", "metrics.jsonl", "curve.png", "config.json"):
+                (self.path / name).unlink(missing_ok=True)
+
+    def is_free(self) -> bool:
+        """Whether a new run may begin here: no folder yet, or an empty one (drafts of a crash aside)."""
+        return not self.path.exists() or (
+            self.path.is_dir() and all(file.name.endswith(".draft") for file in self.path.iterdir())
+        )
 
     def append(self, name: str, rows: list[dict[str, Any]]) -> None:
         """Add lines to rows.jsonl or metrics.jsonl."""
@@ -92,14 +104,21 @@ class Run:
         """The lines of rows.jsonl or metrics.jsonl; a last line that a crash cut off is left out."""
         file = self.path / f"{name}.jsonl"
         lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        try:
+            return [json.loads(line) for line in lines if line.endswith("\n")]
+        except ValueError as error:
+            raise DelayRLError(f"{file} is damaged: {error}") from error
 
     def rewind(self, step: int) -> None:
-        """Forget the rows after a checkpoint that is resumed: they will be made again."""
-        for name in ("rows", "metrics"):
-            if (self.path / f"{name}.jsonl").is_file():
-                kept = [row for row in self.read(name) if row["step"] <= step]
-                _write(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
+        """Forget rows and checkpoints after the step that a run is resumed from: they will be made again."""
+        with _disk(self.path):
+            for name in ("rows", "metrics"):
+                if (self.path / f"{name}.jsonl").is_file():
+                    kept = [row for row in self.read(name) if row["step"] <= step]
+                    _write(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
+            for later in (self.path / "checkpoints").glob("[0-9]*"):
+                if int(later.name) > step:
+                    shutil.rmtree(later)
 
     def checkpoints(self) -> tuple[list[Checkpoint], list[str]]:
         """The good checkpoints, newest first, and one line for each broken one."""
@@ -107,11 +126,15 @@ class Run:
         for path in sorted((self.path / "checkpoints").glob("[0-9]*"), reverse=True):
             try:
                 manifest = json.loads((path / "manifest.json").read_text())
+                if manifest["step"] != int(path.name) or "agent.safetensors" not in manifest["files"]:
+                    raise DelayRLError("its manifest is damaged")
+                if not manifest["complete"] and "loop.safetensors" not in manifest["files"]:
+                    raise DelayRLError("its manifest is damaged")
                 for file, digest in (manifest["files"] | manifest["pieces"]).items():
                     home = self.path / "replay" if file in manifest["pieces"] else path
                     if Path(file).name != file or _digest(home / file) != digest:
                         raise DelayRLError(f"{file} is cut or changed")
-                good.append(Checkpoint(path, manifest["step"], manifest["complete"], manifest["pieces"]))
+                good.append(Checkpoint(path, int(path.name), bool(manifest["complete"]), manifest["pieces"]))
             except (OSError, ValueError, KeyError, TypeError, AttributeError, DelayRLError) as error:
                 broken.append(f"checkpoint {path} is broken ({error}); it is left out")
         return good, broken
@@ -128,7 +151,7 @@ class Run:
     ) -> None:
         """Write a checkpoint beside the older ones, put it in place at once, and keep the one before it."""
         home = self.path / "checkpoints"
-        draft, final = home / f".draft-{os.getpid()}", home / f"{step:012d}"
+        draft, final = home / ".draft", home / f"{step:012d}"
         with _disk(self.path):
             shutil.rmtree(draft, ignore_errors=True)
             draft.mkdir(parents=True)
@@ -213,10 +236,14 @@ def _digest(path: Path) -> str:
 def _write(path: Path, data: bytes, *, rename: bool = True) -> None:
     """Write and flush; through a draft that takes the file's place at once, unless the caller renames."""
     target = path.with_name(path.name + ".draft") if rename else path
-    with open(target, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with open(target, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        target.unlink(missing_ok=True)
+        raise
     if rename:
         target.rename(path)
 

@@ -30,7 +30,7 @@ from delayrl.config import check_names, override, values_of
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.estimate import estimate_seconds
-from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, reset_seed
+from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, check_seed, reset_seed
 from delayrl.learning import compiled
 from delayrl.plots import curve
 from delayrl.policy import spec_of
@@ -41,6 +41,7 @@ from delayrl.types import Metrics, Spec, Transition
 
 Note = Callable[[str], None]
 METRICS_EVERY = 1000
+KEPT = "the last good checkpoint is kept"
 
 
 def train(
@@ -85,9 +86,10 @@ def train(
     entry = find_agent(agent)
     if preset not in entry.presets:
         raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(entry.presets)}")
-    for name, number in (("seed", seed), ("seeds", seeds - 1)):
-        if number < 0:
-            raise DelayRLError(f"{name} must be {'at least 1' if name == 'seeds' else 'no less than 0'}")
+    if seeds < 1:
+        raise DelayRLError(f"seeds must be at least 1; got {seeds}")
+    check_seed(seed)
+    check_seed(seed + seeds - 1)
     if protocol not in ("corrected", "official"):
         raise DelayRLError(f"protocol must be corrected or official; got {protocol!r}")
     base = entry.presets[preset]
@@ -101,7 +103,9 @@ def train(
 
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
     with on_device(device):
-        session = Session(config, schedule, env, delay, [seed + i for i in range(seeds)], protocol == "official")
+        official = protocol == "official"
+        whole = config.ahead if official and entry.drops_last_starts else None
+        session = Session(config, schedule, env, delay, [seed + i for i in range(seeds)], official, whole)
         description = {
             "agent": agent,
             "preset": preset,
@@ -121,7 +125,14 @@ class Session:
     """One call of `train`: the seeds' environments and learners, and where they are written."""
 
     def __init__(
-        self, agent: Agent, schedule: Schedule, env: str, delay: int, seeds: list[int], official: bool = False
+        self,
+        agent: Agent,
+        schedule: Schedule,
+        env: str,
+        delay: int,
+        seeds: list[int],
+        official: bool = False,
+        whole: Callable[[Spec], int] | None = None,
     ):
         self.agent, self.schedule, self.env, self.delay, self.seeds = agent, schedule, env, delay, seeds
         self.official = official
@@ -135,10 +146,12 @@ class Session:
         task = self.actors[0].env.spec
         if task is None or task.max_episode_steps is None:
             raise DelayRLError(f"{env} has no time limit, so evaluation may never end; register it with one")
+        if check := getattr(agent, "check", None):
+            check(schedule)
         self.template = template(agent, self.spec)  # says what does not fit, before anything is stored
-        self.program = compiled(agent, self.spec, agent.ahead(self.spec) if official else 1)
+        self.program = compiled(agent, self.spec, whole(self.spec) if whole else 1)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-        self.step = 0
+        self.step, self.learning = 0, False
         self.pending: Transition | None = None  # the newest step, which the learners have not been given yet
         self.chosen: Any = None  # the next actions, where they have been chosen already
         self.stored: list[dict[str, str]] = [{} for _ in seeds]
@@ -150,43 +163,48 @@ class Session:
         """Create the folders, or resume what is there."""
         self.runs, self.description = runs, description
         self.learner = self.program.init(self.keys, self.schedule.replay_capacity)
-        if overwrite:
-            for run in runs:
-                run.remove()
+        ours = [run for run in runs if overwrite and (run.path / "config.json").exists() and run.config]
+        for run in ours:
+            run.remove()
         for actor in self.actors:
             actor.reset()
         for run, seed in zip(runs, self.seeds, strict=True):
             if (run.path / "config.json").exists():
                 self._check_same(run, description | {"seed": seed})
-            elif run.path.is_dir() and any(run.path.iterdir()):
+            elif run not in ours and not run.is_free():
                 raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
-            else:
-                run.create(description | {"seed": seed, "versions": versions()})
         found = [run.checkpoints() for run in runs]
         for line in (line for _, broken in found for line in broken):
             note(line)
+        if any(good for good, _ in found) and not all(good for good, _ in found):
+            behind = [str(run.path) for run, (good, _) in zip(runs, found, strict=True) if not good]
+            if any(len(good) > 1 or (good and good[0].complete) for good, _ in found):
+                raise DelayRLError(f"{', '.join(behind)} cannot go on beside the other seeds; train those seeds alone")
+        for run, seed in zip(runs, self.seeds, strict=True):
+            if not (run.path / "config.json").exists():
+                run.create(description | {"seed": seed, "versions": versions()})
         common = set.intersection(*({c.step for c in good} for good, _ in found))
         if not common:
-            for (good, broken), run in zip(found, runs, strict=True):
-                if good or broken:
-                    what = "no good checkpoint left" if broken else "no checkpoint of the same step as its neighbours"
-                    raise DelayRLError(f"{run.path} has {what}; --overwrite starts afresh")
+            for (_, broken), run in zip(found, runs, strict=True):
+                if broken:
+                    raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
                 run.rewind(-1)
             return
         step = max(common)
         chosen = [next(c for c in good if c.step == step) for good, _ in found]
-        if any(c.complete for c in chosen) or step:
-            note(f"{'found complete' if chosen[0].complete else 'resumed'} at step {step:,}: {runs[0].path}")
+        note(f"{'found complete' if chosen[0].complete else 'resumed'} at step {step:,}: {runs[0].path}")
         self._restore(chosen)
-        for run in runs:
+        for run, checkpoint in zip(runs, chosen, strict=True):
             run.rewind(step)
+            if checkpoint.complete:
+                run.finish()
 
     @staticmethod
     def _check_same(run: Run, wanted: dict[str, Any]) -> None:
         have = run.config
         for key, value in wanted.items():
             if isinstance(value, dict):
-                changed = [k for k in value if have.get(key, {}).get(k) != value[k]]
+                changed = [k for k in value if have[key].get(k) != value[k]]
             else:
                 changed = [key] if have.get(key) != value else []
             if changed:
@@ -227,6 +245,8 @@ class Session:
         if self.step == 0:
             return
         agent = jax.device_get(self.learner.agent)
+        if not all(np.isfinite(x).all() for x in jax.tree.leaves(agent) if np.issubdtype(x.dtype, np.floating)):
+            raise DelayRLError(f"weights are not finite at step {self.step}: training diverged; {KEPT}")
         for i, (run, actor) in enumerate(zip(self.runs, self.actors, strict=True)):
             mine = flatten_tree(jax.tree.map(lambda x, i=i: x[i], agent))
             if complete:
@@ -258,6 +278,7 @@ class Session:
         """Train to the end, or until the process is asked to stop."""
         schedule = self.schedule
         if self.step >= schedule.steps:
+            self._draw()
             return
         evaluator = self._evaluators()
         trackers = [Tracker(track, run.path) for run in self.runs]
@@ -294,6 +315,9 @@ class Session:
             if stop.is_set() and self.step < schedule.steps:
                 self.save()
                 raise DelayRLError(f"stopped at step {self.step:,}; the same command goes on from there")
+        self._draw()
+
+    def _draw(self) -> None:
         for run in self.runs:
             curve(run.read("rows"), run.path / "curve.png")
 
@@ -315,6 +339,10 @@ class Session:
         if self.pending is None:
             return {}
         due = self.program.due(self.step, self.schedule)
+        if due and not self.learning:
+            self.learning = True
+            if int(self.learner.replay.steps.min()) < self.spec.delay + 1:
+                raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
         transition, self.pending = self.pending, None
         self.learner, new = self.program.learn(self.learner, transition, self._hidden(), self.keys, self.step, due)
         return new
@@ -376,8 +404,7 @@ class Session:
             for name, x in mine.items():
                 if not np.isfinite(x):
                     raise DelayRLError(
-                        f"{name} is {x} at step {self.step} of seed {self.seeds[i]}: training diverged; "
-                        "the last good checkpoint is kept"
+                        f"{name} is {x} at step {self.step} of seed {self.seeds[i]}: training diverged; {KEPT}"
                     )
             run.append("metrics", [{"step": self.step, "steps_per_second": round(speed, 2), **mine}])
             tracker.write(self.step, mine | {"steps_per_second": speed})

@@ -20,12 +20,14 @@ def watch(run: Path, out: Path, delay: int | None = None, seed: int = 0) -> tupl
     """
     if out.suffix not in (".mp4", ".gif"):
         raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")
+    from delayrl.evaluation import HELD_OUT, check_seed, reset_seed
+
+    check_seed(seed)
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
     import imageio
 
     from delayrl.envs import make
-    from delayrl.evaluation import HELD_OUT, reset_seed
     from delayrl.policy import load
     from delayrl.runs import Run
 

@@ -32,6 +32,8 @@ def check_spaces(env: gym.Env[Any, Any]) -> None:
         )
     if not isinstance(actions, Box) or len(actions.shape) != 1:
         raise DelayRLError(f"{name}: actions must be a flat Box (continuous); got {actions}")
+    if not (np.issubdtype(actions.dtype, np.floating) and (actions.low < actions.high).all()):
+        raise DelayRLError(f"{name}: actions must be real numbers with low < high; got {actions}")
     if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
         raise DelayRLError(f"{name}: actions must be bounded; got {actions}. Wrap it with RescaleAction or a clip")
 

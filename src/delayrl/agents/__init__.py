@@ -36,6 +36,7 @@ AGENTS: dict[str, Entry] = {
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
         {"paper": Preset(VDPO(), _PAPER), "small": Preset(_small_vdpo, _SMALL)},
+        drops_last_starts=True,
     ),
     "lifting": Entry(
         "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
@@ -46,6 +47,8 @@ AGENTS: dict[str, Entry] = {
         "learns values for a shorter delay, and improves the actor of the long one by them",
         "Wu et al., ICML 2024",
         {"paper": Preset(ADSAC(), _PAPER), "small": Preset(_small_adsac, _SMALL)},
+        official={"evaluation": "sample"},
+        drops_last_starts=True,
     ),
     "dida": Entry(
         "a student on x_t imitates a delay-free SAC expert (DAgger); the expert's steps are counted",

@@ -57,6 +57,7 @@ class ADSAC:
         "who acts in training: of both actors' samples the one with the lower Q (where auxiliary_delay is 0), "
         "or the augmented actor",
     ] = "lower-q"
+    evaluation: Annotated[Literal["mode", "sample"], "which action is evaluated; the released code samples"] = "mode"
 
     @property
     def privileged(self) -> bool:
@@ -90,18 +91,15 @@ class ADSAC:
         """The augmented actor; in training, who acts is what `behaviour` says."""
         auxiliary_key, augmented_key = jax.random.split(key)
         policy = self.learner.policy(state.actor, network_input(seen, "augmented"))
-        if not explore:
-            return networks.mode(policy)
         augmented, _ = networks.sample(policy, augmented_key)
+        if not explore:
+            return networks.mode(policy) if self.evaluation == "mode" else augmented
         if not self.privileged:
             return augmented
         truth = seen.truth
         assert truth is not None, "behaviour with the auxiliary actor is privileged"
         auxiliary, _ = networks.sample(self.learner.policy(state.auxiliary.actor, truth), auxiliary_key)
-        q_auxiliary, q_augmented = (
-            networks.twin(state.auxiliary.critic, truth, action).min(0) for action in (auxiliary, augmented)
-        )
-        return jnp.where(q_auxiliary < q_augmented, auxiliary, augmented)
+        return networks.lower_q(state.auxiliary.critic, truth, auxiliary, augmented)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One critic update; every `actor_every`-th time rounds of a coin's choice of actor, and both temperatures."""

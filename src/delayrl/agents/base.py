@@ -50,6 +50,8 @@ class Agent(Protocol):
         """What it learns, and when."""
         ...
 
+    # An agent whose own schedule must fit the run's also has `check(schedule)`, which raises DelayRLError.
+
     def init(self, spec: Spec, key: Key) -> State:
         """A fresh state. Raises DelayRLError where the agent does not suit the task."""
         ...
@@ -88,6 +90,7 @@ class Entry(NamedTuple):
     paper: str
     presets: dict[str, Preset]
     official: Mapping[str, Any] = MappingProxyType({})  # hyperparameters that the official protocol changes
+    drops_last_starts: bool = False  # in the official protocol: its n-step window is cleared at an episode's end
 
 
 def template(agent: Agent, spec: Spec) -> State:

@@ -56,12 +56,12 @@ class DCAC:
     """Hyperparameters; the defaults are the released code's."""
 
     hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
-    learning_rate: Annotated[float, "Adam's step size, for actor and critics together"] = 3e-4
-    actor_share: Annotated[float, "weight of the actor's loss; the critics' gets the rest of 1"] = 0.2
+    learning_rate: Annotated[float, "Adam's step size, for actor and critics together", (0.0, 1.0)] = 3e-4
+    actor_share: Annotated[float, "weight of the actor's loss; the critics' gets the rest of 1", (0.0, 1.0)] = 0.2
     reward_scale: Annotated[float, "rewards are multiplied by it"] = 5.0
     entropy_scale: Annotated[float, "fixed weight of the entropy"] = 1.0
-    discount: Annotated[float, "γ"] = 0.99
-    target_rate: Annotated[float, "τ: how far the target critics move each update"] = 5e-3
+    discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
+    target_rate: Annotated[float, "τ: how far the target critics move each update", (0.0, 1.0)] = 5e-3
     log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-20.0, 2.0)
     batch_size: Annotated[int, "windows in a batch"] = 128
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from delayrl import networks
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Phase, descend
+from delayrl.agents.base import Agent, Phase, Schedule, descend
 from delayrl.errors import DelayRLError
 from delayrl.networks import Params
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
@@ -46,8 +46,8 @@ class DIDA:
     round_steps: Annotated[int, "environment steps in a round of aggregation, the student acting"] = 1000
     imitation_updates: Annotated[int, "updates after each round, on fresh batches of all the data"] = 1000
     student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)
-    student_learning_rate: Annotated[float, "RMSprop's step size"] = 1e-3
-    student_decay: Annotated[float, "RMSprop's memory of squared gradients"] = 0.9
+    student_learning_rate: Annotated[float, "RMSprop's step size", (0.0, 1.0)] = 1e-3
+    student_decay: Annotated[float, "RMSprop's memory of squared gradients", (0.0, 1.0)] = 0.9
     student_batch_size: Annotated[int, "windows in a batch of imitation"] = 32
 
     privileged = True
@@ -67,10 +67,20 @@ class DIDA:
         """The expert."""
         return self.reference, state.reference
 
+    def check(self, schedule: Schedule) -> None:
+        """The expert learns after the random steps, the student before the run ends."""
+        if not schedule.random_steps < self.expert_steps < schedule.steps:
+            raise DelayRLError(
+                f"expert_steps must lie between random_steps and steps, {schedule.random_steps} and {schedule.steps}; "
+                f"got {self.expert_steps}"
+            )
+
     def init(self, spec: Spec, key: Key) -> State:
         """Fresh networks."""
         if spec.delay < 1:
             raise DelayRLError("dida learns a policy for a delay of at least 1 step: give --delay N, or train sac")
+        if (self.reference.update_every, self.reference.updates) != (1, 1):
+            raise DelayRLError("dida's expert is updated once a step: leave update_every and updates at 1")
         if self.expert_steps % self.round_steps:
             raise DelayRLError(
                 f"expert_steps must be whole rounds of {self.round_steps} steps; got {self.expert_steps}"

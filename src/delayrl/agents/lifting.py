@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Phase
+from delayrl.agents.base import Agent, Phase, Schedule
 from delayrl.errors import DelayRLError
 from delayrl.networks import Gaussian
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
@@ -44,7 +44,7 @@ class Lifting:
     """Hyperparameters; the defaults are the released code's."""
 
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, initial_temperature=0.2))
-    lifting_weight: Annotated[float, "weight of the lifting loss at first"] = 10.0
+    lifting_weight: Annotated[float, "weight of the lifting loss at first", (0.0, 1e6)] = 10.0
     lifting_hold: Annotated[int, "environment step up to which it keeps that weight"] = 250_000
     lifting_end: Annotated[int, "environment step at which the weight has gone linearly to 0"] = 750_000
 
@@ -66,6 +66,14 @@ class Lifting:
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
         """The delay-free SAC that the delayed policy is pulled towards."""
         return self.reference, state.reference
+
+    def check(self, schedule: Schedule) -> None:
+        """The weight must have gone to 0 before the run ends."""
+        if self.lifting_end > schedule.steps:
+            raise DelayRLError(
+                f"lifting_end must be no later than steps, {schedule.steps}; got {self.lifting_end} "
+                "(the original holds the weight for a quarter of the run, and ends at three quarters)"
+            )
 
     def init(self, spec: Spec, key: Key) -> State:
         """Fresh networks of two SACs."""

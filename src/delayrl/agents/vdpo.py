@@ -25,6 +25,7 @@ from delayrl.agents.base import Agent, Phase, descend
 from delayrl.errors import DelayRLError
 from delayrl.networks import Gaussian, Params
 from delayrl.objectives import gaussian_kl, masked_mean
+from delayrl.transformer import transformer, transformer_init
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.views import view
 
@@ -61,8 +62,8 @@ class VDPO:
     representation: Annotated[Representation, "of x_t; the paper's ablation"] = "transformer"
     width: Annotated[int, "embedding dimension of the transformer, and width of the policy head"] = 256
     layers: Annotated[int, "blocks of the transformer"] = 3
-    dropout: Annotated[float, "rate in embedding, attention and residuals"] = 0.1
-    learning_rate: Annotated[float, "Adam's step size for the delayed policy"] = 3e-4
+    dropout: Annotated[float, "rate in embedding, attention and residuals", (0.0, 0.99)] = 0.1
+    learning_rate: Annotated[float, "Adam's step size for the delayed policy", (0.0, 1.0)] = 3e-4
     clone_every: Annotated[int, "environment steps between two rounds of cloning"] = 1000
     clone_updates: Annotated[int, "KL updates in a round, each on a fresh batch"] = 1000
     direction: Annotated[Direction, "KL(delayed‖reference), or forward: KL(reference‖delayed)"] = "reverse"
@@ -99,7 +100,7 @@ class VDPO:
         features = spec.obs_size + spec.delay * spec.action_size + 1
         if self.representation != "mlp":
             sizes = (spec.obs_size, spec.action_size, spec.delay, self.width, self.layers)
-            encoder, features = networks.transformer_init(encoder_key, *sizes), self.width
+            encoder, features = transformer_init(encoder_key, *sizes), self.width
         decoder = networks.linear_init(decoder_key, features, spec.obs_size, 0.02)
         head = networks.mlp_init(head_key, (features, self.width, self.width, 2 * spec.action_size), 0.02)
         adam = optax.adam(self.learning_rate)
@@ -132,10 +133,7 @@ class VDPO:
             return reference
         if self.behaviour == "mixture":
             return jnp.where(jax.random.bernoulli(coin_key), reference, delayed)
-        q_reference, q_delayed = (
-            networks.twin(state.reference.critic, truth, action).min(0) for action in (reference, delayed)
-        )
-        return jnp.where(q_reference < q_delayed, reference, delayed)
+        return networks.lower_q(state.reference.critic, truth, reference, delayed)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """(A) SAC's update of the reference; and of encoder and belief decoder (eq. 10), on the same batch."""
@@ -165,7 +163,7 @@ class VDPO:
             unseen(windows),
             key,
         )
-        return self._with_cloned(state, cloned)._replace(clone_memory=memory), {"kl": loss}
+        return state._replace(**cloned, clone_memory=memory), {"kl": loss}
 
     def policy(self, state: State, obs: Array, actions: Array, key: Key | None = None) -> Gaussian:
         """The delayed policy for every age 1..Δ: [..., Δ, A]."""
@@ -176,7 +174,7 @@ class VDPO:
     ) -> Float[Array, "*batch delay width"]:
         """What the heads read at each age. `mlp`: the augmented state of that age itself."""
         if self.representation != "mlp":
-            return networks.transformer(encoder, obs, actions, self.dropout, key)
+            return transformer(encoder, obs, actions, self.dropout, key)
         *batch, delay, size = actions.shape
         until = jnp.where(jnp.tril(jnp.ones((delay, delay), bool))[..., None], actions[..., None, :, :], 0)
         ages = jnp.broadcast_to(jnp.arange(1, delay + 1)[:, None] / delay, (*batch, delay, 1))
@@ -191,7 +189,7 @@ class VDPO:
 
     def clone_loss(self, cloned: Params, state: State, x: Unseen, key: Key) -> tuple[Array, None]:
         """KL between the delayed policy at each age and the reference at the state that it cannot see (eq. 11)."""
-        delayed = self.policy(self._with_cloned(state, cloned), x.obs, x.actions, key)
+        delayed = self.policy(state._replace(**cloned), x.obs, x.actions, key)
         reference = self.reference.policy(state.reference.actor, x.states)
         pair = (delayed, reference) if self.direction == "reverse" else (reference, delayed)
         return masked_mean(gaussian_kl(*pair).mean(-1), x.mask), None
@@ -199,9 +197,6 @@ class VDPO:
     def _cloned(self, encoder: Params, head: Params) -> Params:
         """What cloning trains: the head; without a belief loss the encoder too."""
         return {"head": head, "encoder": encoder} if self.representation == "transformer-no-belief" else {"head": head}
-
-    def _with_cloned(self, state: State, cloned: Params) -> State:
-        return state._replace(**cloned)
 
 
 def unseen(windows: Window) -> Unseen:

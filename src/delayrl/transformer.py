@@ -1,0 +1,98 @@
+"""The causal transformer of VDPO, as pure functions on plain trees of arrays."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from delayrl.networks import Params, cut, linear, uniform
+from delayrl.types import Key
+
+
+def layer_norm(params: Params, x: Float[Array, "*batch width"]) -> Float[Array, "*batch width"]:
+    """Normalise the last axis; ε = 1e-5."""
+    centred = x - x.mean(-1, keepdims=True)
+    return centred * jax.lax.rsqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * params["scale"] + params["shift"]
+
+
+def dropout(key: Key | None, rate: float, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Zero a share `rate` of the entries and scale up the rest; without a key, nothing."""
+    if key is None or rate == 0:
+        return x
+    return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0)
+
+
+def transformer_init(key: Key, obs_size: int, action_size: int, length: int, width: int, layers: int) -> Params:
+    """Weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform: as the released code of VDPO."""
+    normal_key, uniform_key = jax.random.split(key)
+    square = (width, width)
+    shapes = [(obs_size, width), (action_size, width), (2 * width, width), (length, width), *[square] * (3 * layers)]
+    of_obs, of_action, join, position, *rest = (0.02 * w for w in cut(jax.random.normal, normal_key, shapes))
+    xavier = cut(uniform, uniform_key, [(width, 3 * width)] * layers)
+
+    def biased(w: Array) -> Params:
+        return {"w": w, "b": jnp.zeros(w.shape[1])}
+
+    def normed() -> Params:
+        return {"scale": jnp.ones(width), "shift": jnp.zeros(width)}
+
+    blocks = [
+        {
+            "norm1": normed(),
+            "qkv": biased((6 / (4 * width)) ** 0.5 * qkv),
+            "out": biased(out),
+            "norm2": normed(),
+            "mlp": [biased(first), biased(second)],
+        }
+        for qkv, out, first, second in zip(xavier, rest[::3], rest[1::3], rest[2::3], strict=True)
+    ]
+    return {
+        "obs": biased(of_obs),
+        "action": biased(of_action),
+        "join": biased(join),
+        "position": position,
+        "norm_in": normed(),
+        "blocks": blocks,
+        "norm_out": normed(),
+    }
+
+
+def transformer(
+    params: Params,
+    obs: Float[Array, "*batch obs"],
+    actions: Float[Array, "*batch length action"],
+    rate: float = 0.0,
+    key: Key | None = None,
+) -> Float[Array, "*batch length width"]:
+    """Causal transformer of VDPO (§3.3): token i joins the last observation with the i-th action since.
+
+    Position i depends on `obs` and actions 0..i only: it serves the delay i + 1, and padding at the end has no
+    influence before it. One head; post-embedding layer norm; each block overwrites its stream by its first layer norm.
+
+    Args:
+        params: of `transformer_init`.
+        obs: the last observation that has arrived.
+        actions: the actions taken since, oldest first.
+        rate: dropout rate, in embedding, attention and residuals alike.
+        key: for dropout; None switches it off.
+    """
+    length, width = params["position"].shape
+    keys = iter(
+        [None] * (1 + 3 * len(params["blocks"]))
+        if key is None
+        else jax.random.split(key, 1 + 3 * len(params["blocks"]))
+    )
+    # join([e_obs, e_action]) as two products: the observation's half is the same for every token
+    w_obs, w_action = jnp.split(params["join"]["w"], 2)
+    from_obs = linear(params["obs"], obs) @ w_obs + params["join"]["b"]
+    x = from_obs[..., None, :] + linear(params["action"], actions) @ w_action + params["position"]
+    x = dropout(next(keys), rate, layer_norm(params["norm_in"], x))
+    causal = jnp.tril(jnp.ones((length, length), bool))
+    for block in params["blocks"]:
+        x = layer_norm(block["norm1"], x)
+        query, keyed, value = jnp.split(linear(block["qkv"], x), 3, -1)
+        scores = jnp.einsum("...td,...sd->...ts", query, keyed) * width**-0.5
+        attention = dropout(next(keys), rate, jax.nn.softmax(jnp.where(causal, scores, -jnp.inf)))
+        x = x + dropout(next(keys), rate, linear(block["out"], jnp.einsum("...ts,...sd->...td", attention, value)))
+        hidden = jax.nn.gelu(linear(block["mlp"][0], layer_norm(block["norm2"], x)), approximate=False)
+        x = x + dropout(next(keys), rate, linear(block["mlp"][1], hidden))
+    return layer_norm(params["norm_out"], x)
