@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import jax
@@ -167,6 +168,62 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
     assert not (run.path / "replay").exists()
 
 
+def test_stopped_between_checkpoints_and_resumed(tmp_path: Path, monkeypatch) -> None:
+    """A run that is asked to stop keeps its newest step and goes on with it, bit for bit."""
+    whole = train("bpql", tmp_path / "whole")
+    step, calls = Actor.step, 0
+
+    def interrupted(self, action):
+        nonlocal calls
+        calls += 1
+        if calls == 157:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, action)
+
+    monkeypatch.setattr(Actor, "step", interrupted)
+    with pytest.raises(delayrl.DelayRLError, match="stopped at step 157"):
+        train("bpql", tmp_path / "cut")
+    assert "pending.obs" in Run(tmp_path / "cut").latest().arrays("loop")
+    resumed = train("bpql", tmp_path / "cut")
+    assert resumed.read("rows") == whole.read("rows")
+    for name, array in arrays(resumed).items():
+        np.testing.assert_array_equal(array, arrays(whole)[name])
+
+
+def test_overwrite_touches_only_runs(tmp_path: Path) -> None:
+    """Folders of others are refused whole; a run's folder keeps what others put there."""
+    mine = tmp_path / "mine"
+    (mine / "checkpoints").mkdir(parents=True)
+    (mine / "config.json").write_text('{"lr": 1}')
+    (mine / "checkpoints" / "best.pt").write_text("x")
+    with pytest.raises(delayrl.DelayRLError, match="of another program"):
+        train("random", mine, overwrite=True)
+    assert (mine / "checkpoints" / "best.pt").exists()
+    run = train("random", tmp_path / "run", steps=120)
+    (run.path / "episode.gif").write_text("x")
+    assert len(train("random", run.path, steps=150, overwrite=True).read("rows")) == 4
+    assert (run.path / "episode.gif").exists()
+    with pytest.raises(delayrl.DelayRLError):
+        train("random", run.path / "episode.gif", overwrite=True)
+
+
+def test_damaged_configuration(tmp_path: Path) -> None:
+    """Wrong types and missing names are one line."""
+    run = train("random", tmp_path / "run", steps=120)
+    good = run.config
+    for change in ({"agent": ["vdpo"]}, {"env": 3}, {"delay": None}, {"schedule": None}, {"hyperparameters": 7}):
+        (run.path / "config.json").write_text(json.dumps(good | change))
+        with pytest.raises(delayrl.DelayRLError, match="damaged"):
+            delayrl.load(run.path)
+
+
+def test_agents_check_the_schedule(tmp_path: Path) -> None:
+    with pytest.raises(delayrl.DelayRLError, match="expert_steps must lie between"):
+        train("dida", tmp_path / "dida", expert_steps=400)
+    with pytest.raises(delayrl.DelayRLError, match="lifting_end must be no later"):
+        train("lifting", tmp_path / "lifting", lifting_end=400)
+
+
 def test_complete_run_is_given_back(vdpo: Run, monkeypatch) -> None:
     monkeypatch.setattr(Actor, "step", lambda *_: pytest.fail("it trains again"))
     assert train("vdpo", vdpo.path).read("rows") == vdpo.read("rows")
@@ -266,7 +323,8 @@ def test_nan_from_the_environment(what: str, tmp_path: Path, monkeypatch) -> Non
     assert train("bpql", tmp_path / "run").latest().step == 300
 
 
-def test_full_disk(tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("nth", [1, 9])
+def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
     """One line, no row lost, and the run goes on when there is room."""
     import os
 
@@ -275,7 +333,7 @@ def test_full_disk(tmp_path: Path, monkeypatch) -> None:
     def full(file):
         nonlocal calls
         calls += 1
-        if calls == 9:
+        if calls == nth:
             raise OSError(28, "No space left on device")
         return fsync(file)
 

@@ -414,7 +414,8 @@ class Session:
         steps = f"for {self.schedule.steps - self.step:,} steps on this device"
         if hours < 0.5:
             return f"about {max(1, round(hours * 60))} min {steps}"
-        return f"about {hours:.1f} h {steps}; --preset small takes minutes"
+        advice = "; --preset small takes minutes" if self.description["preset"] == "paper" else ""
+        return f"about {hours:.1f} h {steps}{advice}"
 
 
 def find_agent(name: str) -> Any:
