@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,9 @@ def watch(run: Path, out: Path, delay: int | None = None, seed: int = 0) -> tupl
             stride = max(1, round(rate / 25))
             imageio.mimsave(out, frames[::stride], duration=1000 * stride / rate, loop=0)
         else:
-            imageio.mimsave(out, frames, fps=rate, macro_block_size=None)
+            with warnings.catch_warnings():  # on the fork that starts the encoder, beside JAX's idle threads
+                warnings.simplefilter("ignore", RuntimeWarning)
+                imageio.mimsave(out, frames, fps=rate, macro_block_size=None)
     except OSError as error:
         raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
     return len(frames), total
