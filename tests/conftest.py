@@ -1,7 +1,10 @@
 """Shapes in annotations are checked while the tests run; compiled code is not optimised, which halves their time."""
 
+import gc
 import os
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
@@ -19,6 +22,7 @@ install_import_hook(
     "beartype.beartype",
 )
 
+import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
@@ -42,6 +46,16 @@ TINY = {
     "dida": DIDA(TINY_SAC, expert_steps=110, round_steps=10, imitation_updates=3, student_hidden=(8, 8)),
     "vdpo": VDPO(TINY_SAC, width=8, layers=2, clone_every=10, clone_updates=3),
 }
+
+
+@pytest.fixture(autouse=True)
+def few_memory_maps() -> Iterator[None]:
+    """Linux gives a process 65,530 memory maps; each compiled function takes some, and without any XLA crashes."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
