@@ -42,6 +42,16 @@ def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=N
     return learner, metrics, keys
 
 
+def counted(delay: int, steps: int, batch: int, ahead: int):
+    """Random play of the counter, and windows of it."""
+    transitions, _ = record("delayrl/Counter-v0", delay, steps)
+    replay = ring.init(Spec(2, 1, delay), 2 * steps)
+    for transition in transitions:
+        replay = jax.jit(ring.append)(replay, transition)
+    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+    return transitions, sample(replay, jax.random.key(0), batch, delay, ahead, jnp.int32(0))
+
+
 def same(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
@@ -78,11 +88,7 @@ def test_zero_delay_is_one_algorithm() -> None:
 
 def test_views_are_what_the_table_says() -> None:
     """Actor and critic of each agent see s_t, s_{t-d} or x_t, and nothing else."""
-    transitions, _ = record("delayrl/Counter-v0", 3, 60)
-    replay = ring.init(Spec(2, 1, 3), 100)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 50, 3, 1, jnp.int32(0))
+    _, windows = counted(3, 60, batch=50, ahead=1)
     true, late = windows.obs[:, 3, 0], windows.obs[:, 3, 0] - windows.age[:, 3]
     for name, actor_time, critic_time, sizes in (
         ("sac-memoryless", late, late, (2, 2)),
@@ -181,11 +187,7 @@ def test_memoryless_sees_no_actions(rng: np.random.Generator) -> None:
 
 def test_bpql_is_aligned() -> None:
     """On a counter: critics at (s_t, a_t) with t the true step, the actor at s_{t-d} with the actions since."""
-    transitions, _ = record("delayrl/Counter-v0", 2, 80)
-    replay = ring.init(Spec(2, 1, 2), 200)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 500, 2, 1, jnp.int32(0))
+    transitions, windows = counted(2, 80, batch=500, ahead=1)
     actor, critic = TINY["bpql"]._inputs(windows, 0)
     actor_next, critic_next = TINY["bpql"]._inputs(windows, windows.steps)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
@@ -234,11 +236,7 @@ def test_actor_and_temperature_move_every_second_time() -> None:
 
 def test_unseen_is_what_the_delay_hides() -> None:
     """x_{t+1}: the states after its observation, in order, up to s_{t+1}; fewer at the start of an episode."""
-    transitions, _ = record("delayrl/Counter-v0", 4, 150)
-    replay = ring.init(Spec(2, 1, 4), 300)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 400, 4, 3, jnp.int32(0))
+    transitions, windows = counted(4, 150, batch=400, ahead=3)
     x = unseen(windows)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     for i in range(400):

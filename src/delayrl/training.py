@@ -162,7 +162,6 @@ class Session:
     def open(self, runs: list[Run], description: dict[str, Any], overwrite: bool, note: Note) -> None:
         """Create the folders, or resume what is there."""
         self.runs, self.description = runs, description
-        self.learner = self.program.init(self.keys, self.schedule.replay_capacity)
         ours = [run for run in runs if overwrite and (run.path / "config.json").exists() and run.config]
         for run in ours:
             run.remove()
@@ -183,6 +182,7 @@ class Session:
         for run, seed in zip(runs, self.seeds, strict=True):
             if not (run.path / "config.json").exists():
                 run.create(description | {"seed": seed, "versions": versions()})
+        self.learner = self.program.init(self.keys, self.schedule.replay_capacity)
         common = set.intersection(*({c.step for c in good} for good, _ in found))
         if not common:
             for (_, broken), run in zip(found, runs, strict=True):
