@@ -6,7 +6,7 @@ A controller for the pendulum that acts on the newest observation, with and with
 import gymnasium as gym
 import numpy as np
 
-from delayrl.wrappers import AugmentedObservation, DelayedObservation
+from delayrl.wrappers import AugmentedObservation, Delayed
 
 
 def swing_up(obs: np.ndarray) -> np.ndarray:
@@ -18,7 +18,7 @@ def swing_up(obs: np.ndarray) -> np.ndarray:
 
 
 for delay in (0, 1, 3, 5):
-    env = DelayedObservation(gym.make("Pendulum-v1"), delay=delay)
+    env = Delayed(gym.make("Pendulum-v1"), delay=delay)
     returns = []
     for seed in range(10):
         obs, info = env.reset(seed=seed)

@@ -9,23 +9,29 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from delayrl.agents import AGENTS as AGENTS
-    from delayrl.delays import Constant as Constant
+    from delayrl.delays import Delay as Delay
+    from delayrl.delays import as_delay as as_delay
     from delayrl.envs import make as make
     from delayrl.errors import DelayRLError as DelayRLError
     from delayrl.policy import Policy as Policy
     from delayrl.policy import load as load
     from delayrl.training import train as train
     from delayrl.wrappers import AugmentedObservation as AugmentedObservation
-    from delayrl.wrappers import DelayedObservation as DelayedObservation
+    from delayrl.wrappers import AugmentedVectorObservation as AugmentedVectorObservation
+    from delayrl.wrappers import Delayed as Delayed
+    from delayrl.wrappers import DelayedVector as DelayedVector
 
 __version__ = "0.1.0"
 
 _HOME = {
     "AGENTS": "agents",
     "AugmentedObservation": "wrappers",
-    "Constant": "delays",
+    "AugmentedVectorObservation": "wrappers",
     "DelayRLError": "errors",
-    "DelayedObservation": "wrappers",
+    "Delay": "delays",
+    "Delayed": "wrappers",
+    "DelayedVector": "wrappers",
+    "as_delay": "delays",
     "Policy": "policy",
     "load": "policy",
     "make": "envs",

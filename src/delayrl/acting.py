@@ -10,14 +10,14 @@ from delayrl.errors import DelayRLError
 from delayrl.evaluation import TRAINING, reset_seed
 from delayrl.types import Seen, Transition
 from delayrl.views import seen_now
-from delayrl.wrappers import DelayedObservation
+from delayrl.wrappers import Delayed
 
 
 @dataclass
 class Actor:
     """One seed's environment, and where it is in its current episode."""
 
-    env: DelayedObservation
+    env: Delayed
     seed: int
     privileged: bool
     official: bool = False
@@ -69,7 +69,7 @@ class Actor:
             self._see(obs, info)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:
-        self.seen = seen_now(obs, info, self.env.law.maximum, privileged=self.privileged)
+        self.seen = seen_now(obs, info, self.env.history, privileged=self.privileged)
         self.truth = np.asarray(info["truth"], np.float32)
         if not np.isfinite(self.truth).all():
             self._refuse("an observation")

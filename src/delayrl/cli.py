@@ -45,14 +45,15 @@ def _run(arguments: list[str]) -> None:
     evaluate = commands.add_parser("evaluate", help="play a trained policy on start states that it never saw")
     evaluate.add_argument("run", type=Path, help="the run folder")
     evaluate.add_argument("--episodes", type=int, default=10, help="how many (default: 10)")
-    evaluate.add_argument("--delay", type=_delay, help="another delay than the one it was trained for")
+    evaluate.add_argument("--delay", metavar="DELAY", help="another delay than the one it was trained for")
+    evaluate.add_argument("--sweep", action="store_true", help="every delay from 0 to the longest, with a picture")
     evaluate.add_argument("--seed", type=int, default=0, help="of the start states (default: 0)")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
 
     watch = commands.add_parser("watch", help="render an episode to a file")
     watch.add_argument("run", type=Path, help="the run folder")
     watch.add_argument("--out", type=Path, required=True, help="an .mp4 or .gif file")
-    watch.add_argument("--delay", type=_delay, help="another delay than the one it was trained for")
+    watch.add_argument("--delay", metavar="DELAY", help="another delay than the one it was trained for")
     watch.add_argument("--seed", type=int, default=0, help="of the start state (default: 0)")
 
     commands.add_parser("agents", help="list the agents")
@@ -85,7 +86,7 @@ def _train(arguments: list[str]) -> None:
 
     parser = Parser(prog=f"delayrl train {name}", description=entry.summary, allow_abbrev=False)
     parser.add_argument("--env", required=True, metavar="ID", help="a Gymnasium task; `delayrl tasks` lists some")
-    parser.add_argument("--delay", type=_delay, default=0, metavar="N", help="environment steps (default: 0)")
+    parser.add_argument("--delay", default="0", metavar="DELAY", help="steps, or e.g. 80ms, uniform:1:5 (default: 0)")
     parser.add_argument("--preset", choices=list(entry.presets), default="paper", help="the defaults (default: paper)")
     parser.add_argument("--seed", type=int, default=0, metavar="K", help="fixes everything (default: 0)")
     parser.add_argument(
@@ -135,7 +136,7 @@ def _summary(run: Any) -> None:
     last = max((row["step"] for row in rows), default=0)
     print(f"{config['agent']} on {config['env']}, delay {config['delay']}, seed {config['seed']}: {last:,} steps")
     for policy, label in (
-        ("agent", "return under delay" if config["delay"] else "return"),
+        ("agent", "return under delay" if config["delay"] != 0 else "return"),
         ("reference", "its reference, no delay"),
     ):
         returns = [row["return"] for row in rows if row["step"] == last and row["policy"] == policy]
@@ -148,8 +149,13 @@ def _summary(run: Any) -> None:
 
 
 def _evaluate(given: argparse.Namespace) -> None:
-    from delayrl.evaluation import evaluate
+    from delayrl.evaluation import evaluate, sweep
 
+    if given.sweep:
+        if given.delay is not None:
+            raise DelayRLError("--sweep plays every delay; leave --delay out")
+        _sweep(given, sweep(given.run, given.episodes, given.seed))
+        return
     result = evaluate(given.run, given.episodes, given.delay, given.seed)
     if given.json:
         print(json.dumps(result))
@@ -158,6 +164,19 @@ def _evaluate(given: argparse.Namespace) -> None:
         f"{result['agent']} on {result['env']}, delay {result['delay']}: return {result['mean_return']:.1f} "
         f"± {result['std_return']:.1f} over {result['episodes']} episodes"
     )
+
+
+def _sweep(given: argparse.Namespace, results: list[dict[str, Any]]) -> None:
+    from delayrl.plots import against_delay
+
+    if given.json:
+        print(json.dumps(results))
+    else:
+        rows = [[r["delay"], f"{r['mean_return']:.1f}", f"{r['std_return']:.1f}", r["episodes"]] for r in results]
+        _table(["delay", "mean return", "std", "episodes"], rows)
+    picture = given.run / "delays.png"
+    against_delay(results, picture)
+    print(f"picture: {picture}", file=sys.stderr)
 
 
 def _watch(given: argparse.Namespace) -> None:
@@ -197,13 +216,3 @@ def _table(head: list[str], rows: list[list[Any]]) -> None:
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     for row in cells:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def _delay(text: str) -> int:
-    from delayrl.delays import Constant
-
-    try:
-        number = float(text)
-    except ValueError:
-        raise DelayRLError(f"--delay takes a number of environment steps; got {text!r}") from None
-    return Constant(int(number) if number.is_integer() else number).steps  # type: ignore[arg-type]

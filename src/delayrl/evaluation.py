@@ -13,8 +13,8 @@ from jaxtyping import Array
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State
-from delayrl.delays import DelayLaw, as_law
-from delayrl.envs import make
+from delayrl.delays import Delay
+from delayrl.envs import delay_of, make
 from delayrl.errors import DelayRLError
 from delayrl.policy import load
 from delayrl.runs import Run
@@ -36,17 +36,17 @@ class Evaluator:
         agent: whose policy is played.
         spec: the task as the agent was trained on it.
         env: id of the task.
-        delay: under which it is played; its maximum must not be longer than `spec.delay`.
+        delay: under which it is played; its maximum must not be longer than `spec.delay`. A text or number for `make`.
         seeds: length of the seed axis of the states.
         episodes: how many for each.
     """
 
-    def __init__(self, agent: Agent, spec: Spec, env: str, delay: int | DelayLaw, seeds: int, episodes: int) -> None:
-        law = as_law(delay)
-        if law.maximum > spec.delay:
-            raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {law.maximum}")
+    def __init__(self, agent: Agent, spec: Spec, env: str, delay: int | str | Delay, seeds: int, episodes: int) -> None:
+        late = delay_of(env, delay).acted()
+        if late.maximum > spec.delay:
+            raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {late.maximum}")
         self._delay = spec.delay
-        self._envs = [[make(env, law, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        self._envs = [[make(env, late, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
         self._act = _compiled_act(agent)
 
     def __call__(
@@ -116,13 +116,13 @@ TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
 """Streams of `reset_seed`: start states of evaluation are none of training's, those of `evaluate` none of either."""
 
 
-def evaluate(run: str | Path, episodes: int = 10, delay: int | None = None, seed: int = 0) -> dict[str, Any]:
+def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None, seed: int = 0) -> dict[str, Any]:
     """Play the policy of a run folder on start states that it never saw.
 
     Args:
         run: the run folder.
         episodes: how many.
-        delay: any delay that it can serve; None for the one it was trained for.
+        delay: any delay that it can serve, a number or a text; None for the one it was trained for.
         seed: of the start states.
 
     Returns:
@@ -135,17 +135,22 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | None = None, seed
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
     check_seed(seed)
     policy, config = load(run), Run(Path(run)).config
-    delay = config["delay"] if delay is None else delay
-    evaluator = Evaluator(policy.agent, policy.spec, config["env"], delay, 1, episodes)
+    late = delay_of(config["env"], config["delay"] if delay is None else delay)
+    evaluator = Evaluator(policy.agent, policy.spec, config["env"], late, 1, episodes)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
     returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
     return {
         "agent": config["agent"],
         "env": config["env"],
-        "delay": delay,
+        "delay": late.label(),
         "episodes": episodes,
         "mean_return": float(returns.mean()),
         "std_return": float(returns.std()),
         "returns": returns.tolist(),
     }
+
+
+def sweep(run: str | Path, episodes: int = 10, seed: int = 0) -> list[dict[str, Any]]:
+    """`evaluate` at every constant delay from 0 to the longest age that the policy was trained for."""
+    return [evaluate(run, episodes, delay, seed) for delay in range(load(run).spec.delay + 1)]

@@ -1,6 +1,8 @@
 """Pictures, from rows alone."""
 
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +13,45 @@ COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
 def curve(rows: list[dict[str, Any]], path: Path) -> None:
     """The learning curve of one run: mean return of each evaluation, and the range of its episodes, against steps."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     if not rows:
         return
     returns: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         returns[row["policy"]][row["step"]].append(row["return"])
-    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
     first = rows[0]
-    for policy, points in returns.items():
-        steps = sorted(points)
-        values = [np.asarray(points[step]) for step in steps]
-        label = f"{first['agent']}, delay {first['delay']}" if policy == "agent" else "its reference, no delay"
-        axes.plot(steps, [v.mean() for v in values], color=COLOURS[policy], label=label, marker="o", markersize=3)
-        low, high = [v.min() for v in values], [v.max() for v in values]
-        axes.fill_between(steps, low, high, color=COLOURS[policy], alpha=0.15, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel="return", title=f"{first['env']}, seed {first['seed']}")
+    with _axes(path) as axes:
+        for policy, points in returns.items():
+            label = f"{first['agent']}, delay {first['delay']}" if policy == "agent" else "its reference, no delay"
+            _band(axes, sorted(points), [points[step] for step in sorted(points)], COLOURS[policy], label)
+        axes.set(xlabel="environment steps", ylabel="return", title=f"{first['env']}, seed {first['seed']}")
+        axes.legend(frameon=False)
+
+
+def against_delay(results: list[dict[str, Any]], path: Path) -> None:
+    """What one policy returns at each delay: the mean of its episodes, and their range. `results`: of `sweep`."""
+    first = results[0]
+    with _axes(path) as axes:
+        _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOURS["agent"], first["agent"])
+        title = f"{first['env']}, one policy, {first['episodes']} episodes a point"
+        axes.set(xlabel="delay of the observations (steps)", ylabel="return", title=title)
+
+
+def _band(axes: Any, x: list[float], values: list[list[float]], colour: str, label: str) -> None:
+    axes.plot(x, [np.mean(v) for v in values], color=colour, label=label, marker="o", markersize=3)
+    low, high = [np.min(v) for v in values], [np.max(v) for v in values]
+    axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+
+
+@contextmanager
+def _axes(path: Path) -> Iterator[Any]:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    yield axes
     axes.grid(alpha=0.25)
-    axes.legend(frameon=False)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     figure.savefig(path, dpi=130)

@@ -39,7 +39,7 @@ class Policy:
         Args:
             obs: the newest observation that has arrived, [S].
             info: `age`, and `actions` [≥ age, A] taken since, oldest first, in the task's own units: what
-                `DelayedObservation` puts there.
+                `Delayed` puts there.
 
         Raises:
             DelayRLError: wrong sizes, or an age that the policy was not trained for.
@@ -87,4 +87,4 @@ def agent_of(config: dict[str, Any]) -> Agent:
 
 def spec_of(env: Any) -> Spec:
     """Sizes and longest age of a wrapped task."""
-    return Spec(env.observation_space.shape[0], env.action_space.shape[0], env.law.maximum)
+    return Spec(env.observation_space.shape[0], env.action_space.shape[0], env.history)

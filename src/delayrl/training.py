@@ -7,6 +7,7 @@ from the steps before it.
 """
 
 import difflib
+import re
 import signal
 import sys
 import threading
@@ -27,7 +28,8 @@ from delayrl.acting import Actor
 from delayrl.agents import AGENTS
 from delayrl.agents.base import Agent, Schedule, template
 from delayrl.config import check_names, override, values_of
-from delayrl.envs import make
+from delayrl.delays import Delay
+from delayrl.envs import delay_of, make, physics
 from delayrl.errors import DelayRLError
 from delayrl.estimate import estimate_seconds
 from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, check_seed, reset_seed
@@ -47,7 +49,7 @@ KEPT = "the last good checkpoint is kept"
 def train(
     agent: str,
     env: str,
-    delay: int = 0,
+    delay: int | str | Delay = 0,
     *,
     preset: str = "paper",
     seed: int = 0,
@@ -65,7 +67,7 @@ def train(
     Args:
         agent: its name in the registry (`delayrl agents`).
         env: id of a Gymnasium task (`delayrl tasks`).
-        delay: Δ, in environment steps.
+        delay: environment steps, or a text such as "uniform:1:5@fifo" or "80ms+action=2" (`delayrl.delays`).
         preset: "paper" or "small": which hyperparameters to start from.
         seed: fixes everything: environments, networks, sampling.
         seeds: trains the seeds seed .. seed + seeds - 1 in lockstep.
@@ -97,7 +99,9 @@ def train(
     values = (dict(entry.official) if protocol == "official" else {}) | values
     config, schedule = override(base.agent, values), override(base.schedule, values)
     kind = f"{agent}-{preset}" if protocol == "corrected" else f"{agent}-{preset}-{protocol}"
-    group = Path(out) if out is not None else Path("runs") / f"{env.replace('/', '-')}-delay{delay}" / kind
+    late = delay_of(env, delay)
+    folder = re.sub(r"[^\w.=+@-]+", "-", f"{env}-delay{late.label()}")
+    group = Path(out) if out is not None else Path("runs") / folder / kind
     single_home = group if out is not None else group / f"seed{seed}"
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
@@ -105,12 +109,12 @@ def train(
     with on_device(device):
         official = protocol == "official"
         whole = config.ahead if official and entry.drops_last_starts else None
-        session = Session(config, schedule, env, delay, [seed + i for i in range(seeds)], official, whole)
+        session = Session(config, schedule, env, late, [seed + i for i in range(seeds)], official, whole)
         description = {
             "agent": agent,
             "preset": preset,
             "env": env,
-            "delay": delay,
+            "delay": late.plain(),
             "protocol": protocol,
             "privileged": config.privileged,
             "hyperparameters": values_of(config),
@@ -129,15 +133,18 @@ class Session:
         agent: Agent,
         schedule: Schedule,
         env: str,
-        delay: int,
+        delay: Delay,
         seeds: list[int],
         official: bool = False,
         whole: Callable[[Spec], int] | None = None,
     ):
         self.agent, self.schedule, self.env, self.delay, self.seeds = agent, schedule, env, delay, seeds
         self.official = official
-        self.actors = [Actor(make(env, delay, rescale=True), seed, agent.privileged, official) for seed in seeds]
+        self.actors = [
+            Actor(make(env, delay.observed(), rescale=True), seed, agent.privileged, official) for seed in seeds
+        ]
         self.spec = spec_of(self.actors[0].env)
+        self.physics = physics(self.actors[0].env)
         least = 2 * (self.spec.delay + agent.ahead(self.spec)) + 2
         if schedule.replay_capacity < least:
             raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
@@ -331,7 +338,7 @@ class Session:
         seen = jax.tree.map(lambda *x: np.stack(x), *[actor.seen for actor in self.actors])
         self.chosen = self.program.act(self.learner.agent, seen, self.keys, self.step)
         if self.official and self.spec.delay:  # its first action under delay is random
-            first = np.array([[actor.seen.age == 0] for actor in self.actors])
+            first = np.array([[not actor.actions] for actor in self.actors])
             self.chosen = np.where(first, self._random(), self.chosen)
 
     def _learn(self) -> Metrics:
@@ -352,8 +359,12 @@ class Session:
         return np.stack([draw.uniform(-1, 1, self.spec.action_size).astype(np.float32) for draw in draws])
 
     def _hidden(self) -> NDArray[np.int32]:
-        """How many of the newest observations each seed's learner may not look at."""
-        return np.array([0 if self.agent.privileged else actor.seen.age for actor in self.actors], np.int32)
+        """How many of the newest steps each seed's learner may not look at, because not all of them have arrived.
+
+        Of what is older than the longest delay everything has, even what was overtaken.
+        """
+        longest = 0 if self.agent.privileged else max(self.spec.delay, self.delay.reward.maximum)
+        return np.array([min(len(actor.actions), longest) for actor in self.actors], np.int32)
 
     def _evaluators(self) -> dict[str, Evaluator]:
         count, episodes = len(self.seeds), self.schedule.evaluation_episodes
@@ -378,7 +389,7 @@ class Session:
             first, seeds = np.array(draw, np.float32), [[seed] * len(episodes) for seed in self.seeds]
         keys = jax.vmap(lambda key: jax.random.fold_in(key, self.step))(self.keys)
         for policy, evaluator in evaluators.items():
-            played = evaluator(states[policy], seeds, keys, first if policy == "agent" and self.delay else None)
+            played = evaluator(states[policy], seeds, keys, first if policy == "agent" and self.spec.delay else None)
             summary.append(f"{policy} {played.returns.mean():.4g}")
             for i, (run, tracker) in enumerate(zip(self.runs, trackers, strict=True)):
                 run.append("rows", [self._row(i, policy, e, seeds[i][e], played) for e in episodes])
@@ -388,6 +399,7 @@ class Session:
     def _row(self, i: int, policy: str, episode: int, reset: int, played: Any) -> dict[str, Any]:
         names = ("agent", "env", "delay", "preset", "protocol", "privileged")
         return {name: self.description[name] for name in names} | {
+            "delay": self.delay.label(),
             "seed": self.seeds[i],
             "step": self.step,
             "policy": policy,
@@ -395,6 +407,7 @@ class Session:
             "reset_seed": reset,
             "return": float(played.returns[i, episode]),
             "length": int(played.lengths[i, episode]),
+            **self.physics,
         }
 
     def _log(self, metrics: Metrics, speed: float, trackers: list[Tracker]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from delayrl.errors import DelayRLError
 
 
-def watch(run: Path, out: Path, delay: int | None = None, seed: int = 0) -> tuple[int, float]:
+def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -> tuple[int, float]:
     """Play one episode of a run's policy and write it to an .mp4 or .gif file.
 
     Returns:
@@ -28,13 +28,14 @@ def watch(run: Path, out: Path, delay: int | None = None, seed: int = 0) -> tupl
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
     import imageio
 
-    from delayrl.envs import make
+    from delayrl.envs import delay_of, make
     from delayrl.policy import load
     from delayrl.runs import Run
 
     config = Run(run).config
     policy = load(run)
-    env = make(config["env"], config["delay"] if delay is None else delay, render_mode="rgb_array")
+    late = delay_of(config["env"], config["delay"] if delay is None else delay).acted()
+    env = make(config["env"], late, render_mode="rgb_array")
     obs, info = env.reset(seed=reset_seed(seed, HELD_OUT, 0))
     frames, total, done = [], 0.0, False
     try:

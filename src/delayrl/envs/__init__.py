@@ -5,27 +5,30 @@ import difflib
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import RescaleAction
 
-from delayrl.delays import DelayLaw
+from delayrl.delays import Channel, Delay, DelayLaw
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError
-from delayrl.wrappers import DelayedObservation, check_spaces
+from delayrl.wrappers import Delayed, check_spaces
 
 probe.register()
 paper.register()
 
 
-def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **options: Any) -> DelayedObservation:
-    """A Gymnasium task whose observations arrive late.
+def make(
+    env: str, delay: float | str | DelayLaw | Channel | Delay = 0, *, rescale: bool = False, **options: Any
+) -> Delayed:
+    """A Gymnasium task with a delay.
 
     Args:
         env: an id of Gymnasium's registry, e.g. "InvertedPendulum-v5".
-        delay: environment steps, or a delay law; must be shorter than an episode.
+        delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; shorter than an episode.
         rescale: take (and show in `info`) actions in [-1, 1] instead of the task's own range.
         **options: go to `gymnasium.make`, e.g. `render_mode="rgb_array"`.
 
@@ -41,10 +44,30 @@ def make(env: str, delay: int | DelayLaw = 0, *, rescale: bool = False, **option
         near = difflib.get_close_matches(env, gym.registry, n=3, cutoff=0.5)
         hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists the tasks we know"
         raise DelayRLError(f"unknown task {env!r}; {hint}") from error
-    check_spaces(task)
+    check_spaces(env, task.observation_space, task.action_space)
     if rescale:
         task = RescaleAction(task, np.float32(-1), np.float32(1))
-    return DelayedObservation(task, delay)
+    return Delayed(task, delay)
+
+
+def delay_of(env: str, delay: float | str | DelayLaw | Channel | Delay) -> Delay:
+    """A delay in steps of this task. Raises what `make` raises."""
+    task = make(env, delay)
+    task.close()
+    return task.delay
+
+
+def physics(env: gym.Env[Any, Any]) -> dict[str, str | None]:
+    """What a return depends on besides the agent: versions of Gymnasium and MuJoCo, and the model's fingerprint.
+
+    The last two are None for a task without MuJoCo.
+    """
+    simulated = hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "frame_skip")
+    return {
+        "gymnasium": version("gymnasium"),
+        "mujoco": version("mujoco") if simulated else None,
+        "physics": paper.fingerprint(env) if simulated else None,
+    }
 
 
 @contextlib.contextmanager

@@ -1,0 +1,116 @@
+"""The augmented state as one vector, so that any library can train on a delayed task.
+
+The vector is the shown observation, the actions of the history (oldest first, zeros where there are none yet) and the
+age divided by the history's length H: size S + H·A + 1. Where actions are late by a random time one number is added:
+how old the action was that led to the observation, divided by the longest delay. Without a delay nothing changes.
+"""
+
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorWrapper
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from delayrl.delays import Delay
+from delayrl.errors import DelayRLError
+from delayrl.wrappers.single import Delayed, Info
+from delayrl.wrappers.vector import DelayedVector
+
+
+def _space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, delay: Delay) -> Box:
+    assert isinstance(observations, Box)
+    assert isinstance(actions, Box)
+    if not history:
+        return observations
+    # a slot without an action holds zeros, which the action's own bounds need not contain
+    low, high = np.minimum(actions.low, 0), np.maximum(actions.high, 0)
+    numbers = 1 if delay.action.constant else 2
+    return Box(
+        np.concatenate([observations.low, np.tile(low, history), np.zeros(numbers)]).astype(observations.dtype),
+        np.concatenate([observations.high, np.tile(high, history), np.ones(numbers)]).astype(observations.dtype),
+        dtype=observations.dtype.type,  # type: ignore[arg-type, union-attr]
+    )
+
+
+def _augment(obs: NDArray[Any], info: Info, history: int, delay: Delay, dtype: Any) -> NDArray[Any]:
+    """For one environment, or with a leading axis for many."""
+    if not history:
+        return obs
+    size, actions = obs.shape[-1], info["actions"]
+    end = size + history * actions.shape[-1]
+    vector = np.empty((*obs.shape[:-1], end + (1 if delay.action.constant else 2)), dtype)
+    vector[..., :size] = obs
+    vector[..., size:end] = actions.reshape(*obs.shape[:-1], -1)
+    vector[..., end] = info["age"] / history
+    if not delay.action.constant:
+        vector[..., end + 1] = info["applied"] / delay.action.maximum
+    return vector
+
+
+class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
+    """Shows the augmented state as one vector.
+
+    Args:
+        env: an environment wrapped by `Delayed`.
+    """
+
+    def __init__(self, env: Delayed) -> None:
+        if not isinstance(env, Delayed):
+            raise DelayRLError("AugmentedObservation goes around Delayed: wrap the task with a delay first")
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+        self._history, self._delay = env.history, env.delay
+        self.observation_space = _space(env.observation_space, env.action_space, env.history, env.delay)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
+        """Start an episode."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        return self._augment(obs, info), info
+
+    def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
+        """Act now; see the augmented state of the next step."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return self._augment(obs, info), reward, terminated, truncated, info
+
+    def _augment(self, obs: NDArray[Any], info: Info) -> NDArray[Any]:
+        return _augment(obs, info, self._history, self._delay, self.observation_space.dtype)
+
+
+class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
+    """Shows the augmented states of a vector of environments, [N, S + H·A + 1].
+
+    Args:
+        env: a vector of environments wrapped by `DelayedVector`.
+    """
+
+    def __init__(self, env: DelayedVector) -> None:
+        if not isinstance(env, DelayedVector):
+            raise DelayRLError(
+                "AugmentedVectorObservation goes around DelayedVector: wrap the tasks with a delay first"
+            )
+        super().__init__(env)
+        self._history, self._delay = env.history, env.delay
+        single = _space(env.single_observation_space, env.single_action_space, env.history, env.delay)
+        self.single_observation_space = single
+        self.observation_space = batch_space(single, env.num_envs)
+
+    def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
+        """Start all episodes."""
+        obs, infos = self.env.reset(seed=seed, options=options)
+        return self._augment(obs, infos), infos
+
+    def step(self, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Info]:
+        """Act in all of them."""
+        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        for i in np.flatnonzero(infos.get("_final_obs", [])):
+            last = {name: infos["final_info"][name][i] for name in infos["final_info"] if not name.startswith("_")}
+            infos["final_obs"][i] = self._augment(infos["final_obs"][i], last)
+        return self._augment(obs, infos), rewards, terminated, truncated, infos
+
+    def _augment(self, obs: NDArray[Any], info: Info) -> NDArray[Any]:
+        dtype = self.single_observation_space.dtype
+        return _augment(obs, info, self._history, self._delay, dtype)
