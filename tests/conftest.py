@@ -33,6 +33,7 @@ from delayrl.agents.dida import DIDA  # noqa: E402
 from delayrl.agents.lifting import Lifting  # noqa: E402
 from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
+from delayrl.delays import Delay  # noqa: E402
 from delayrl.envs import make  # noqa: E402
 
 TINY_SAC = SAC(hidden=(16, 16), batch_size=16)
@@ -63,7 +64,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def record(env: str, delay: int, steps: int, seed: int = 0) -> tuple[list, list]:
+def record(env: str, delay: int | str | Delay, steps: int, seed: int = 0) -> tuple[list, list]:
     """Random play: every transition, and what the wrapper showed before each of its actions."""
     rng = np.random.default_rng(seed)
     actor = Actor(make(env, delay, rescale=True), seed, privileged=False)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from delayrl.errors import DelayRLError
 
 FORMAT = 1
-CONFIG = {"agent": str, "preset": str, "env": str, "delay": int, "hyperparameters": dict, "schedule": dict}
+CONFIG = {"agent": str, "preset": str, "env": str, "delay": int | str, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, and of which type."""
 Arrays = dict[str, NDArray[Any]]
 
