@@ -8,13 +8,13 @@ import argparse
 import json
 from pathlib import Path
 
-from delayrl.evaluation import evaluate
+from delayrl.evaluation import evaluate, sweep
 from delayrl.runs import Run
 
 KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
 
 
-def collect(out: Path, runs: list[Path], episodes: int = 0) -> None:
+def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = False) -> None:
     """Write the rows of run folders into one file."""
     lines = []
     for number, path in enumerate(runs):
@@ -25,6 +25,8 @@ def collect(out: Path, runs: list[Path], episodes: int = 0) -> None:
         lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.read("rows")]
         if episodes:
             lines.append({"run": number, "evaluation": evaluate(path, episodes)})
+        if episodes and every_delay:
+            lines += [{"run": number, "sweep": result} for result in sweep(path, episodes)]
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
@@ -35,8 +37,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--episodes", type=int, default=0, help="also evaluate each run on so many unseen start states")
+    parser.add_argument("--every-delay", action="store_true", help="these at every delay that the policy serves, too")
     given = parser.parse_args()
-    collect(given.out, given.runs, given.episodes)
+    collect(given.out, given.runs, given.episodes, given.every_delay)
 
 
 if __name__ == "__main__":

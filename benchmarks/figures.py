@@ -97,6 +97,29 @@ def table(name: str) -> str:
     return "\n".join(lines)
 
 
+def draw_against_delay(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
+    """What the same policies return at every delay that they serve: the mean over seeds, and each seed as a thin line."""
+    lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
+    found: dict[str, dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
+    for line in lines:
+        if "sweep" in line and line["sweep"]["agent"] in labels:
+            result = line["sweep"]
+            found[result["agent"]][line["run"]][result["delay"]] = result["mean_return"]
+    figure, axes = pyplot.subplots(figsize=(7.5, 4), layout="constrained")
+    for agent, runs in found.items():
+        delays = sorted(next(iter(runs.values())))
+        seeds = np.array([[run[delay] for delay in delays] for run in runs.values()])
+        axes.plot(delays, seeds.T, color=COLOURS[agent], alpha=0.25, linewidth=1)
+        axes.plot(delays, seeds.mean(0), color=COLOURS[agent], linewidth=2.2, marker="o", label=labels[agent])
+    axes.set(xlabel="constant delay in evaluation (steps)", ylabel="return", title=title)
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    figure.savefig(out, dpi=140)
+    pyplot.close(figure)
+
+
 def provenance(name: str) -> str:
     """One line: on what the rows were made."""
     configs, _, lines = read(name)
@@ -132,10 +155,16 @@ def main() -> None:
     }
     draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", words)
     draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | {"bpql": f"BPQL, {late}"})
+    if (HERE / "results" / "pusher-random.jsonl").exists():
+        labels = {agent: agent for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
+        title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
+        draw_against_delay("pusher-random", title, images / "pusher-delays.png", labels)
     for name, pages in {
         "pendulum": ["README.md", "docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "walk": ["docs/benchmarks.md"],
+        "walk-random": ["docs/benchmarks.md"],
+        "pusher-random": ["docs/benchmarks.md"],
     }.items():
         if (HERE / "results" / f"{name}.jsonl").exists():
             for page in pages:

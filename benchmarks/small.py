@@ -19,6 +19,8 @@ TASKS: dict[str, dict[str, Any]] = {
     "pendulum": {"env": "InvertedPendulum-v5", "delay": 5},
     "reacher": {"env": "Reacher-v5", "delay": 5, "steps": 10_000, "evaluate_every": 2_000},
     "walk": {"env": "delayrl/Walk-v0", "delay": 4, "steps": 6_000, "evaluate_every": 1_000},
+    "walk-random": {"env": "delayrl/Walk-v0", "delay": "uniform:1:4", "steps": 6_000, "evaluate_every": 1_000},
+    "pusher-random": {"env": "delayrl/Pusher-v4", "delay": "paper-stochastic-5"},
 }
 OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("reacher", "dida"): {"expert_steps": 7_000},
@@ -35,15 +37,15 @@ def main() -> None:
     parser.add_argument("task", choices=list(TASKS))
     parser.add_argument("agents", nargs="*", default=list(AGENTS))
     given = parser.parse_args()
-    options = TASKS[given.task]
+    options, kind = TASKS[given.task], given.task.removesuffix("-random")
     for agent in given.agents:
-        networks = SMALL_NETWORKS if given.task == "walk" and agent != "random" else {}
-        values = options | networks | OWN.get((given.task, agent), {}) | ({"delay": 0} if agent == "sac" else {})
+        networks = SMALL_NETWORKS if kind == "walk" and agent != "random" else {}
+        values = options | networks | OWN.get((kind, agent), {}) | ({"delay": 0} if agent == "sac" else {})
         out = Path("runs/small") / given.task / agent
         delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
         print(f"{agent}: done", flush=True)
     complete = [path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if Run(path).latest().complete]
-    collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", complete, episodes=20)
+    collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", complete, 20, every_delay=kind != given.task)
 
 
 if __name__ == "__main__":
