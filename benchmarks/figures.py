@@ -98,7 +98,7 @@ def table(name: str) -> str:
 
 
 def draw_against_delay(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
-    """What the same policies return at every delay that they serve: the mean over seeds, and each seed as a thin line."""
+    """What the same policies return at every delay that they serve: mean over seeds, each seed as a thin line."""
     lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
     found: dict[str, dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
     for line in lines:
