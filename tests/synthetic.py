@@ -19,10 +19,11 @@ QUALITY = {"vdpo": 1.1, "ad-sac": 1.0, "bpql": 0.95, "dida": 0.8, "dcac": 0.6, "
 RANDOM, REFERENCE = -50.0, 4_000.0
 
 
-def cell(agent: str, env: str, delay: int | str, seeds: int = 3, **changes: Any) -> Cell:
+def cell(agent: str, env: str, delay: int | str, seeds: int | tuple[int, ...] = 3, **changes: Any) -> Cell:
+    seeds = tuple(range(seeds)) if isinstance(seeds, int) else seeds
     values: dict[str, Any] = {
         "id": f"{agent}-{env}-{delay}-{changes.get('overrides', '')}", "agent": agent, "env": env, "delay": delay,
-        "preset": "paper", "protocol": "corrected", "seeds": tuple(range(seeds)), "overrides": {}, "status": "done",
+        "preset": "paper", "protocol": "corrected", "seeds": seeds, "overrides": {}, "status": "done",
         "done": 1_000_000, "total": 1_000_000,
     }  # fmt: skip
     return Cell(**values | changes)

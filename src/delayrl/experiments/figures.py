@@ -113,7 +113,8 @@ def _line(look: Look) -> dict[str, Any]:
 
 
 def _plain(text: str) -> str:
-    return text.replace("$", r"\$")  # else matplotlib reads a formula
+    """A name from the rows: short, no formula, nothing that cannot be drawn."""
+    return text[:60].encode("utf-8", "replace").decode().replace("$", r"\$")
 
 
 def _anchor_lines(axes: Any, result: Result) -> None:

@@ -62,8 +62,8 @@ def report(rows: Iterable[Mapping[str, Any]], cells: Sequence[Cell], out: Path, 
     out = Path(out)
     try:
         pictures = figures.draw(summary, out / "img")
-        (out / "report.md").write_text(markdown(summary, title, pictures))
-        (out / "report.html").write_text(page(summary, title))
+        for name, text in (("report.md", markdown(summary, title, pictures)), ("report.html", page(summary, title))):
+            (out / name).write_text(text, encoding="utf-8", errors="replace")
     except OSError as error:
         raise DelayRLError(f"the report cannot be written to {out}: {error.strerror or error}") from error
     return out / "report.html"
@@ -359,7 +359,7 @@ def payload(summary: Summary, title: str) -> dict[str, Any]:
 
 def page(summary: Summary, title: str) -> str:
     """The HTML page: the template with title and data put in, and a policy that allows its own script alone."""
-    template = resources.files("delayrl.experiments").joinpath("report.html").read_text()
+    template = resources.files("delayrl.experiments").joinpath("report.html").read_text("utf-8")
     script = template.split("<script>")[1].split("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     data = json.dumps(payload(summary, title), separators=(",", ":"), allow_nan=False)
@@ -378,15 +378,17 @@ def read(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
     for path in paths:
         configs: dict[Any, dict[str, Any]] = {}
         try:
-            with open(path) as file:
+            with open(path, "rb") as file:
                 for number_of_line, line in enumerate(file, 1):
                     try:
                         row = json.loads(line)
+                        if not isinstance(row, dict):
+                            raise TypeError
                         if "config" in row:
                             configs[row["run"]] = {name: row["config"][name] for name in names}
                         elif "step" in row:
                             yield configs.get(row.get("run"), {}) | row
-                    except (ValueError, TypeError, KeyError):
+                    except (ValueError, TypeError, KeyError, RecursionError):
                         raise DelayRLError(f"{path}, line {number_of_line}: this is no row of results") from None
         except OSError as error:
             raise DelayRLError(f"{path} cannot be read: {error.strerror}") from error

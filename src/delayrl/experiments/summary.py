@@ -8,7 +8,9 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
+from operator import itemgetter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -259,16 +261,15 @@ class Summary:
     def _published(self, kind: str, env: str, delay: Delay, label: str) -> Figure | None:
         agent, representation = self.labels.get(label, (label, "transformer"))
         measure = "steps" if kind == "steps" else "normalised"
-        wanted = "" if agent != "vdpo" else representation
-        figures = paper()
         key = (measure, env.removeprefix("delayrl/"), str(delay), agent)
-        found = figures.get((*key, wanted))
-        return found or (figures.get((*key, "")) if wanted == "transformer" else None)
+        own = paper().get((*key, representation))  # Table 3; its last column is VDPO itself, in Table 2 again
+        return own if kind == "ablation" or representation != "transformer" else paper().get((*key, ""))
 
 
+@cache
 def paper() -> dict[tuple[str, ...], Figure]:
     """Published figures by (measure, task, delay, agent, representation); the last is "" outside the ablation."""
-    text = resources.files("delayrl.experiments").joinpath("paper.csv").read_text()
+    text = resources.files("delayrl.experiments").joinpath("paper.csv").read_text("utf-8")
     number = lambda word: float(word) if word else NAN  # noqa: E731
     return {
         (row["measure"], row["task"], row["delay"], row["agent"], row["representation"]): Figure(
@@ -337,26 +338,30 @@ class _Points:
 
 def _collect(rows: Iterable[Mapping[str, Any]]) -> dict[Home, _Points]:
     found: dict[Home, _Points] = {}
+    columns = itemgetter(*COLUMNS)
     for number, row in enumerate(rows, 1):
         try:
-            agent, env, delay, preset, protocol, seed, step, policy, episode, value = [row[name] for name in COLUMNS]
-            whole = type(seed) is type(step) is type(episode) is int and 0 <= episode < 10_000
-            whole = whole and 0 <= step < 2**53
-            text = all(isinstance(word, str) for word in (agent, env, preset, protocol, policy))
-            if not (whole and text and type(delay) in (int, str) and math.isfinite(value)):
+            *what, seed, step, policy, episode, value = columns(row)
+            if not (type(seed) is type(step) is type(episode) is int and 0 <= step < 2**53 and 0 <= episode < 10_000):
                 raise TypeError
-            home = (row.get("cell"), agent, env, delay, preset, protocol)
+            if not math.isfinite(value):
+                raise ValueError
+            home = (row.get("cell"), *what)
             if home not in found:
-                found[home] = _Points(bool(row.get("privileged", False)), defaultdict(dict))
+                if not all(
+                    isinstance(x, str) or (i == 2 and type(x) is int and abs(x) < 2**31) for i, x in enumerate(what)
+                ):
+                    raise TypeError
+                found[home] = _Points(row.get("privileged") is True, defaultdict(dict))
+            curve = found[home].curves[policy, seed]
         except KeyError as error:
             raise DelayRLError(f"row {number} of the results has no column {error}") from None
         except (TypeError, ValueError, AttributeError):
             raise DelayRLError(f"row {number} of the results is damaged: {str(row)[:200]}") from None
-        curve = found[home].curves[policy, seed]
         total, episodes = curve.get(step, (0.0, 0))
         if episodes >> episode & 1:
             raise DelayRLError(
-                f"row {number} of the results is there twice: {agent} on {env}, delay {delay}, seed {seed}, "
+                f"row {number} of the results is there twice: {what[0]} on {what[1]}, delay {what[2]}, seed {seed}, "
                 f"step {step}, episode {episode}; give every file of rows once"
             )
         curve[step] = _Point(total + value, episodes | 1 << episode)
@@ -497,10 +502,7 @@ def _tables(results: Mapping[Place, Result]) -> list[Table]:
         varied = {agent: names for agent, names in labels.items() if len(names) > 1}
         main = {n for agent, names in labels.items() for n in names if agent not in varied or n == agent}
 
-        def table(
-            kind: Any, title: str, wanted: set[str], text: bool, setting: Setting = setting, mine: list[Result] = mine
-        ) -> None:
-            chosen = [r for r in mine if r.place.label in wanted and isinstance(r.place.delay, str) == text]
+        def table(kind: Any, title: str, chosen: list[Result], setting: Setting = setting) -> None:
             rows = sorted({(r.place.env, r.place.delay) for r in chosen}, key=lambda x: (x[0], delay_order(x[1])))
             columns = {r.place.label for r in chosen}
             if kind != "ablation" and any((e.removeprefix("delayrl/"), str(d)) in known for e, d in rows):
@@ -508,13 +510,16 @@ def _tables(results: Mapping[Place, Result]) -> list[Table]:
             if rows:
                 tables.append(Table(kind, title, setting, rows, sorted(columns, key=agent_order)))
 
-        table("normalised", "Normalised return, constant delays", main, False)
-        table("steps", "Steps to the delay-free return", main, False)
+        constant = [r for r in mine if r.place.label in main and not isinstance(r.place.delay, str)]
+        table("normalised", "Normalised return, constant delays", constant)
+        table("steps", "Steps to the delay-free return", constant)
         for agent, names in sorted(varied.items()):
-            table("ablation", f"Ablation of {agent}", names, False)
-        table("stochastic", "Normalised return, stochastic delays", main, True)
-        for agent, names in sorted(varied.items()):
-            table("ablation", f"Ablation of {agent}, stochastic delays", names, True)
+            variants = [r for r in mine if r.place.label in names]
+            compared = {(r.place.env, r.place.delay) for r in variants if r.place.label != agent}
+            ablation = [r for r in variants if (r.place.env, r.place.delay) in compared]
+            table("ablation", f"Ablation of {agent}", ablation)
+        stochastic = [r for r in mine if r.place.label in main and isinstance(r.place.delay, str)]
+        table("stochastic", "Normalised return, stochastic delays", stochastic)
     return tables
 
 
