@@ -313,7 +313,7 @@ def payload(summary: Summary, title: str) -> dict[str, Any]:
     def table_of(t: Table) -> dict[str, Any]:
         def cell(row: tuple[str, Delay], column: str) -> list[Any]:
             entry = summary.entry(t, row, column)
-            return [_digits(entry.value), *_words(t, entry)]
+            return [_digits(entry.value), entry.partial, *_words(t, entry)]
 
         return {
             "kind": t.kind,

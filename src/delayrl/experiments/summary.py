@@ -207,7 +207,7 @@ class Entry(NamedTuple):
     """One place of a table: ours, the raw return beside it, and the paper's; NaN or "" where there is none.
 
     `value` is a normalised return or a number of steps, `note` says what else must be known of it. `missed`: training
-    is over and the threshold was not reached.
+    is over and the threshold was not reached. `partial`: no seed has reached its last step.
     """
 
     value: float
@@ -215,6 +215,7 @@ class Entry(NamedTuple):
     raw: float
     raw_std: float
     missed: bool
+    partial: bool
     note: str
     published: Figure | None
 
@@ -245,7 +246,7 @@ class Summary:
         published = self._published(table.kind, *row, column)
         result = self.results.get(Place(table.setting, *row, column))
         if result is None or (result.status == "todo" and not result.runs):
-            return Entry(NAN, NAN, NAN, NAN, False, "", published)
+            return Entry(NAN, NAN, NAN, NAN, False, False, "", published)
         raw, raw_std = statistics.mean_std(result.curves.final)
         notes = [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
         missed = False
@@ -253,10 +254,11 @@ class Summary:
             value, std = result.steps_to_threshold, NAN
             if not math.isnan(result.reference_anchor.value) and result.runs:
                 missed = math.isnan(value) and not result.partial
-                notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds reach it")
+                notes += [f"{n}/{result.runs} seeds"] if (n := result.seeds_at_threshold) else []
         else:
             value, std = statistics.mean_std(result.normalise(result.curves.final))
-        return Entry(value, std, raw, raw_std, missed, " · ".join([*notes, *result.progress]), published)
+        note = " · ".join([*notes, *result.progress])
+        return Entry(value, std, raw, raw_std, missed, result.partial, note, published)
 
     def _published(self, kind: str, env: str, delay: Delay, label: str) -> Figure | None:
         agent, representation = self.labels.get(label, (label, "transformer"))
