@@ -19,6 +19,11 @@ ORDER = [
     "evaluation",
     "acting learning estimate",
     "training video",
+    "experiments",
+    "experiments.statistics",
+    "experiments.summary",
+    "experiments.figures",
+    "experiments.report",
     "cli",
     "__main__",
 ]

@@ -1,0 +1,1 @@
+"""Experiments: from a grid to tables, and a report of them."""

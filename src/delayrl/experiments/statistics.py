@@ -1,0 +1,91 @@
+"""Statistics of many runs, as functions on arrays (NumPy alone).
+
+A *score* is one number for each run. Scores of several tasks are a list of arrays, one for each task: *strata*. Runs
+of different tasks are never exchanged for each other when uncertainty is estimated. Method: Agarwal et al., "Deep
+reinforcement learning at the edge of the statistical precipice", NeurIPS 2021.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+NAN = math.nan
+
+
+def mean_std(values: ArrayLike) -> tuple[float, float]:
+    """Mean, and standard deviation with n - 1; NaN where there is no value, or but one."""
+    x = np.asarray(values, float)
+    return (float(x.mean()) if x.size else NAN), (float(x.std(ddof=1)) if x.size > 1 else NAN)
+
+
+def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
+    """(R - random) / (reference - random), the paper's Ret_nor; NaN unless the reference is better than random."""
+    x = np.asarray(returns, float)
+    return (x - random) / (reference - random) if reference > random else np.full(x.shape, NAN)
+
+
+def steps_to_threshold(steps: ArrayLike, returns: ArrayLike, threshold: float) -> Floats:
+    """The first of the steps, [N], at which a curve, [..., N], is at the threshold or above it; NaN where none is."""
+    steps, reached = np.asarray(steps, float), np.asarray(returns, float) >= threshold
+    if not steps.size:
+        return np.full(reached.shape[:-1], NAN)
+    return np.where(reached.any(-1), steps[reached.argmax(-1)], NAN)
+
+
+def interquartile_mean(scores: ArrayLike) -> Floats:
+    """Mean of the middle half of the last axis: a quarter of the scores, rounded down, is cut at either end."""
+    x = np.sort(np.asarray(scores, float), axis=-1)
+    cut = x.shape[-1] // 4
+    return x[..., cut : x.shape[-1] - cut].mean(-1)
+
+
+def stratified_bootstrap(
+    strata: Sequence[ArrayLike],
+    statistic: Callable[[Floats], Floats],
+    repetitions: int = 2000,
+    level: float = 0.95,
+    seed: int = 0,
+) -> tuple[Floats, Floats]:
+    """Percentile interval of a statistic of pooled scores. Runs are drawn with replacement within their stratum.
+
+    Args:
+        strata: scores of each task, at least one in each.
+        statistic: of scores [repetitions, runs], along the last axis; gives [repetitions, ...].
+        repetitions: how many times.
+        level: of the interval.
+        seed: of the draws: the same scores give the same interval.
+
+    Returns:
+        Lower and upper bound; NaN where a stratum has fewer than two runs, because their spread is then unknown.
+    """
+    arrays = [np.asarray(scores, float) for scores in strata]
+    random = np.random.default_rng(seed)
+    drawn = [x[random.integers(x.size, size=(repetitions, x.size))] for x in arrays]
+    values = statistic(np.concatenate(drawn, axis=-1))
+    tail = 50 * (1 - level)
+    low, high = np.percentile(values, [tail, 100 - tail], axis=0)
+    if min(x.size for x in arrays) < 2:
+        low, high = np.full_like(low, NAN), np.full_like(high, NAN)
+    return low, high
+
+
+def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
+    """Fraction of the scores, [..., runs], that lie above each threshold, [T]: [..., T]."""
+    x, thresholds = np.sort(np.asarray(scores, float), axis=-1), np.asarray(thresholds, float)
+    if not x.shape[-1]:
+        return np.full((*x.shape[:-1], thresholds.size), NAN)
+    flat = x.reshape(-1, x.shape[-1])
+    above = np.stack([x.shape[-1] - np.searchsorted(row, thresholds, side="right") for row in flat])
+    return (above / x.shape[-1]).reshape(*x.shape[:-1], thresholds.size)
+
+
+def common_steps(runs: Sequence[tuple[Sequence[int], Sequence[float]]]) -> tuple[NDArray[np.int64], Floats]:
+    """Curves on the steps that every run has: steps [N], returns [runs, N]. A mean never changes its company."""
+    if not runs:
+        return np.zeros(0, np.int64), np.zeros((0, 0))
+    steps = sorted(set(runs[0][0]).intersection(*(points for points, _ in runs[1:])))
+    curves = [dict(zip(points, returns, strict=True)) for points, returns in runs]
+    return np.array(steps, np.int64), np.array([[curve[step] for step in steps] for curve in curves], float)
