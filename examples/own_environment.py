@@ -1,6 +1,6 @@
 """Your own environment with delays on all three channels, and with a delay that you measured.
 
-A cart on a rail that a network controls: positions arrive late, commands too, and so does the news of a crash. Only NumPy
+A cart that a network controls: positions arrive late, commands too, and so does the news of a crash. Only NumPy
 and Gymnasium are needed. The delays come from a file such as a logger writes, one travel time in seconds a line.
 """
 

@@ -102,7 +102,7 @@ class Choice:
 
     def draw(self, memory: int, random: np.random.Generator) -> tuple[int, int]:
         """One of the steps."""
-        return self.steps[_pick(self._cumulative, random)], memory
+        return self.steps[bisect_right(self._cumulative, random.random())], memory
 
     def shifted(self, steps: int) -> Self:
         """Longer by `steps`."""
@@ -110,7 +110,7 @@ class Choice:
 
     @cached_property
     def _cumulative(self) -> list[float]:
-        return list(itertools.accumulate(self.probabilities))
+        return _cumulated(self.probabilities)
 
     def __str__(self) -> str:
         pairs = zip(self.steps, self.probabilities, strict=True)
@@ -144,7 +144,7 @@ class Markov:
 
     def draw(self, memory: int, random: np.random.Generator) -> tuple[int, int]:
         """The delay of the next state; the first is drawn from the chain's stationary distribution."""
-        state = _pick(self._rows[memory], random)
+        state = bisect_right(self._rows[memory], random.random())
         return self.steps[state], state + 1
 
     def shifted(self, steps: int) -> Self:
@@ -161,7 +161,7 @@ class Markov:
 
     @cached_property
     def _rows(self) -> list[list[float]]:
-        return [list(itertools.accumulate(row)) for row in (self.stationary, *self.transitions)]
+        return [_cumulated(row) for row in (self.stationary, *self.transitions)]
 
     def __str__(self) -> str:
         rows = "/".join(",".join(map(_text, row)) for row in self.transitions)
@@ -318,8 +318,9 @@ def _scaled(weights: Any) -> tuple[float, ...]:
     return tuple((np.asarray(weights) / np.sum(weights)).tolist())
 
 
-def _pick(cumulative: list[float], random: np.random.Generator) -> int:
-    return min(bisect_right(cumulative, random.random() * cumulative[-1]), len(cumulative) - 1)
+def _cumulated(probabilities: tuple[float, ...]) -> list[float]:
+    """For `bisect_right` with a number below 1, which the last entry is, whatever rounding made of the sum."""
+    return [*list(itertools.accumulate(probabilities))[:-1], 1.0]
 
 
 def _gamma_below(shape: float, x: float) -> float:

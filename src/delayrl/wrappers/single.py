@@ -120,7 +120,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
         """Act; see what has arrived by the next step."""
-        applied = self._transit.act(np.array(action, self._dtype))
+        applied = self._transit.act(np.asarray(action, self._dtype))
         reward, terminated, truncated = 0.0, False, False
         if not self._transit.over:
             self._last, reward, terminated, truncated, self._info = self.env.step(applied)  # type: ignore[assignment]
@@ -135,8 +135,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         else:
             actions = np.zeros((self.history, recent.shape[1]), recent.dtype)
             actions[:age] = recent
-        truth = np.array(self._last)
-        info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy(), "truth": truth}
+        info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy(), "truth": self._last}
         if self.delay.action.maximum:
             info["observation_age"], info["applied"] = age - self.delay.action.maximum, late
         return obs.copy(), info

@@ -5,7 +5,7 @@ delayed task Markov again where that is possible (docs/concepts.md says where no
 actions that may not have acted yet when it was made.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +16,13 @@ Fill = Literal["first", "zeros"]
 """What is shown before anything has arrived: s_0, which then has no delay, or zeros."""
 
 
-class Shown(NamedTuple):
-    """What is seen at one step: views of what the transit keeps, to be copied before the next step.
-
-    `actions` are the `age` newest that were issued, oldest first. `late` is how old the action was that led to the
-    shown observation, whose own age is `age` less the longest action delay.
-    """
-
-    obs: NDArray[Any]
-    age: int
-    actions: NDArray[Any]
-    late: int
-
-
 class Line:
     """Messages 0, 1, … on one channel; of those that have arrived, which counts. -1 before any has."""
 
     def __init__(self, channel: Channel):
         self._law, self._raw, self._fifo = channel.law, channel.rule == "raw", channel.rule == "fifo"
         self._slots = channel.maximum + 1
+        self._constant = channel.maximum if channel.constant else None  # the short way, for what is most common
         self.start()
 
     def start(self, newest: int = -1) -> None:
@@ -44,6 +32,8 @@ class Line:
 
     def send(self, number: int, random: np.random.Generator) -> int:
         """Send message `number`, at time `number`; which counts now. Numbers go up by one."""
+        if self._constant is not None:
+            return max(number - self._constant, self._newest)
         travel, self._memory = self._law.draw(self._memory, random)
         if self._raw:
             return max(number - travel, -1)
@@ -93,6 +83,10 @@ class Rewards:
 class Transit:
     """The delayed side of one environment.
 
+    Attributes:
+        over: the episode has ended in truth, and the agent has not been told yet: nothing acts any more.
+        random: where travel times are drawn from.
+
     Args:
         delay: of observations, actions and rewards.
         history: rows of the shown action buffer, at least `delay.maximum`.
@@ -125,7 +119,8 @@ class Transit:
         if seed is not None:
             self.random = np.random.default_rng([seed, 1])
         self._time = 0
-        self._end: int | None = None
+        self._end: int | None = None  # when the agent is told that the episode is over, once it is
+        self.over = False
         self._ring[:] = self._idle
         self._rewards.start()
         if self._acting:
@@ -137,11 +132,6 @@ class Transit:
         else:
             self._lines.start()
             self._shown = self._lines.send(0, self.random)
-
-    @property
-    def over(self) -> bool:
-        """The episode has ended in truth, and the agent has not been told yet: nothing acts any more."""
-        return self._end is not None
 
     def act(self, action: NDArray[Any]) -> NDArray[Any]:
         """Issue an action; the one that acts now, which is the same array if nothing is late."""
@@ -167,7 +157,7 @@ class Transit:
         if self._late_rewards:
             if self._end is None:
                 arrival = self._rewards.send(float(reward), self._time, self.random)
-                self._end = arrival if terminated else None
+                self._end, self.over = (arrival, True) if terminated else (None, False)
             reward = self._rewards.receive(self._time)
             # a time limit is the learner's own: it ends the waiting
             terminated = self._end is not None and (truncated or self._end == self._time)
@@ -175,12 +165,17 @@ class Transit:
                 reward += self._rewards.flush()
         return reward, terminated, truncated
 
-    def shown(self) -> Shown:
-        """What is seen now."""
+    def shown(self) -> tuple[NDArray[Any], int, NDArray[Any], int]:
+        """What is seen now: views of what is kept here, to be copied before the next step.
+
+        Returns:
+            The observation; `age`; the `age` newest actions that were issued, oldest first; and how old the action was
+            that led to the observation, whose own age is `age` less the longest action delay.
+        """
         now, shown = self._time, self._shown
         age = (now - shown if shown >= 0 else now) + self._lag
         first = (now - age) % self._rows
         actions, slot = self._ring[first : first + age], shown % self._slots
         if shown < 0:
-            return Shown(np.zeros_like(self._states[0]), age, actions, 0)
-        return Shown(self._states[slot], age, actions, self._applied[slot])
+            return np.zeros_like(self._states[0]), age, actions, 0
+        return self._states[slot], age, actions, self._applied[slot]

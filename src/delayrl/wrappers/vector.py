@@ -101,15 +101,16 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     def _show(self, transits: list[Transit], truth: NDArray[Any]) -> tuple[NDArray[Any], Info]:
         """What is seen in each of these, with a leading axis."""
         shown = [transit.shown() for transit in transits]
-        obs = np.array([one.obs for one in shown])
-        actions = np.zeros((len(shown), self.history, shown[0].actions.shape[1]), shown[0].actions.dtype)
-        for row, one in zip(actions, shown, strict=True):
-            row[: one.age] = one.actions
-        age = np.array([one.age for one in shown])
-        late = {"age": age, "actions": actions, "mask": self._masks[age], "truth": np.array(truth)}
+        size = shown[0][2].shape[1]
+        actions = np.zeros((len(shown), self.history, size), self._dtype)
+        for row, (_, age, recent, _) in zip(actions, shown, strict=True):
+            row[:age] = recent
+        ages = np.array([age for _, age, _, _ in shown])
+        obs = np.array([one for one, _, _, _ in shown])
+        late = {"age": ages, "actions": actions, "mask": self._masks[ages], "truth": np.array(truth)}
         if self.delay.action.maximum:
-            late["observation_age"] = age - self.delay.action.maximum
-            late["applied"] = np.array([one.late for one in shown])
+            late["observation_age"] = ages - self.delay.action.maximum
+            late["applied"] = np.array([applied for _, _, _, applied in shown])
         return obs, late
 
     def _said(self, late: Info) -> Info:

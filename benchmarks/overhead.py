@@ -1,0 +1,69 @@
+"""What the wrappers cost: steps of HalfCheetah-v5 with and without them, alternating: `python benchmarks/overhead.py`.
+
+Writes benchmarks/results/overhead.jsonl, from which figures.py makes the table.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from delayrl.envs import quiet
+from delayrl.provenance import versions
+from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
+
+TASK = "HalfCheetah-v5"
+ROUNDS = 31
+DELAYS = ("5", "50", "uniform:1:5@fifo")
+
+
+def seconds(env: Any, steps: int) -> float:
+    """Of processor time, for one step."""
+    env.reset(seed=0)
+    actions = [env.action_space.sample() for _ in range(64)]
+    began = time.process_time()
+    for i in range(steps):
+        *_, terminated, truncated, _ = env.step(actions[i % 64])
+        if not isinstance(terminated, np.ndarray) and (terminated or truncated):
+            env.reset()
+    return (time.process_time() - began) / steps
+
+
+def main() -> None:
+    """Measure, alternating."""
+    with quiet():
+        cases: list[tuple[str, int, Any, Any]] = []
+        bare = gym.make(TASK, disable_env_checker=True)
+        for delay in DELAYS:
+            one = Delayed(gym.make(TASK, disable_env_checker=True), delay)
+            cases += [
+                (f"Delayed {delay}", 1, bare, one),
+                (f"AugmentedObservation {delay}", 1, bare, AugmentedObservation(one)),
+            ]
+        for count in (4, 16):
+            many = gym.make_vec(TASK, count, "sync")
+            late = DelayedVector(gym.make_vec(TASK, count, "sync"), "5")
+            cases += [("DelayedVector 5", count, many, late)]
+            cases += [("AugmentedVectorObservation 5", count, many, AugmentedVectorObservation(late))]
+        ratios: dict[tuple[str, int], list[float]] = {case[:2]: [] for case in cases}
+        for number in range(ROUNDS):
+            for name, count, without, wrapped in cases:
+                steps = 1000 // count
+                before, with_it, after = seconds(without, steps), seconds(wrapped, steps), seconds(without, steps)
+                ratios[name, count].append(2 * with_it / (before + after))
+            print(f"\rround {number + 1} of {ROUNDS}", end="", file=sys.stderr)
+    lines = [{"versions": versions(), "task": TASK, "rounds": ROUNDS}]
+    for (name, count), values in ratios.items():
+        low, middle, high = np.percentile(values, [25, 50, 75]).round(3).tolist()
+        lines.append({"wrapper": name, "environments": count, "ratio": middle, "quartiles": [low, high]})
+        print(f"\n{name}, {count}: {middle} ({low} to {high})", end="", file=sys.stderr)
+    out = Path(__file__).parent / "results" / "overhead.jsonl"
+    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+if __name__ == "__main__":
+    main()
