@@ -56,6 +56,8 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         self._mode = getattr(mode, "value", mode or "NextStep")
         self._masks, self._dtype = single.masks(self.history), actions.dtype
         self._ended = np.zeros(env.num_envs, bool)
+        self._present = np.ones(env.num_envs, bool)
+        self._present.setflags(write=False)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Info | None = None
@@ -74,18 +76,20 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Info]:
         """Act in all of them."""
         actions = np.array(actions, self._dtype)
-        reset_only = self._ended if self._mode == "NextStep" else np.zeros_like(self._ended)  # their action is not used
-        for i, transit in enumerate(self._transits):
-            if not reset_only[i]:
-                applied = transit.act(actions[i])
-                if self.delay.action.maximum:
-                    actions[i] = applied
+        # those that this step only resets: their action is not used
+        reset_only = set(np.flatnonzero(self._ended)) if self._mode == "NextStep" and self._ended.any() else ()
+        for i, (transit, action) in enumerate(zip(self._transits, actions, strict=True)):
+            if i not in reset_only:
+                applied = transit.act(action)
+                if applied is not action:
+                    action[:] = applied
         truth, rewards, terminated, truncated, infos = self.env.step(actions)
         done = np.asarray(terminated) | np.asarray(truncated)
+        ended_here = set(np.flatnonzero(done)) if self._mode == "SameStep" and done.any() else ()
         for i, transit in enumerate(self._transits):
-            if reset_only[i]:
+            if i in reset_only:
                 transit.reset(truth[i])
-            elif done[i] and self._mode == "SameStep":
+            elif i in ended_here:
                 transit.step(infos["final_obs"][i], 0.0, False, False)
                 last, late = self._show([transit], infos["final_obs"][i][None])
                 infos["final_obs"][i] = last[0]
@@ -115,5 +119,4 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def _said(self, late: Info) -> Info:
         """Gymnasium's way to say whose entries these are: everybody's."""
-        present = np.ones(self.num_envs, bool)
-        return {f"_{name}": present for name in late}
+        return {f"_{name}": self._present for name in late}
