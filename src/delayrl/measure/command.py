@@ -101,8 +101,8 @@ def find(target: str) -> str | Callable[[], Env]:
     sys.path.insert(0, "")  # a module beside us, as `python -m` would find it
     try:
         module = importlib.import_module(name)
-    except ImportError as error:
-        raise DelayRLError(f"cannot import {name!r}: {error}") from error
+    except Exception as error:  # a module may raise anything
+        raise DelayRLError(f"cannot import {name!r}: {str(error).split(chr(10))[0]}") from error
     finally:
         sys.path.remove("")
     function = getattr(module, attribute, None)
@@ -167,7 +167,7 @@ def _counts(title: str, counts: Counts | None) -> list[str]:
         return [f"{title:<18} unknown"]
     if len(counts) == 1:
         ((steps, count),) = counts.items()
-        return [f"{title:<18} {_plural(steps, 'step')}  (each of {count} times)"]
+        return [f"{title:<18} {_plural(steps, 'step')}  ({count} times)"]
     total = sum(counts.values())
     mean = sum(steps * count for steps, count in counts.items()) / total
     head = f"{title:<18} {min(counts)} to {max(counts)} steps, mean {mean:.2f}, {total} times"

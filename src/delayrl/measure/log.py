@@ -158,7 +158,7 @@ def from_log(
 def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, warm_up: float | None) -> Estimated:
     if len(made) < 10:
         raise DelayRLError(f"{path} has {len(made)} rows: too short, at least 10 are needed")
-    delays, start = arrived - made, arrived - arrived[0]
+    delays, start = arrived - made, made - made[0]
     if (np.diff(made) < 0).any():
         row = int(np.argmax(np.diff(made) < 0)) + 2
         raise DelayRLError(
@@ -220,7 +220,8 @@ def _correlated(
             f"at most {rows // 6 * row:.3g} s"
         )
     u, y = correlate.innovations(commands, observations, episode)
-    sums, sizes = correlate.blocks(u, y, lags, int(np.clip(rows // (2 * lags), 8, BLOCKS)))
+    blocks = int(np.clip(rows // (2 * lags), WINDOWS, BLOCKS)) // WINDOWS * WINDOWS  # windows are whole blocks
+    sums, sizes = correlate.blocks(u, y, lags, blocks)
     whole = correlate.correlation(sums, sizes, lags)
     first = correlate.onset(whole)
     if first is None:
@@ -303,6 +304,8 @@ def plot(estimated: Estimated, out: Path) -> None:
         axes.axvline(estimated.delay * 1e3, color="#1a7f37")
         axes.plot(lag * 1e3, strength, color="#1f6feb", marker=".", label="innovations, 1 = chance")
         axes.set(xlabel="dead time, ms", ylabel="strength of the response", yscale="symlog", ylim=(0, None))
+        shown = 1e3 * max(4 * estimated.high, 2 * estimated.peak.lag if estimated.peak else 0)
+        axes.set(xlim=(0, min(shown, lag[-1] * 1e3)))
         axes.axhline(1, color="#8c8c8c", linewidth=1, linestyle="--")
         other = axes.twinx()
         other.plot(lag * 1e3, np.abs(r), color="#d1242f", alpha=0.7, label="increments, |r| of the best pair")

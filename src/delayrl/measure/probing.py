@@ -98,6 +98,10 @@ def probe(
     task = _make(env)
     try:
         return _probe(task, episodes, seed, longest, wrap)
+    except DelayRLError:
+        raise
+    except Exception as error:  # an environment may raise anything
+        raise DelayRLError(f"{task} failed while it was played: {_line(error)}") from error
     finally:
         if made:
             task.close()
@@ -268,9 +272,16 @@ def _make(env: str | Env | Callable[[], Env]) -> Env:
         from delayrl.envs import make
 
         return make(env).env
-    made = env()
+    try:
+        made = env()
+    except Exception as error:
+        raise DelayRLError(f"{getattr(env, '__name__', env)}() failed: {_line(error)}") from error
     if not isinstance(made, gym.Env):
         raise DelayRLError(
             f"{getattr(env, '__name__', env)}() must return a Gymnasium environment; got {type(made).__name__}"
         )
     return made
+
+
+def _line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {str(error).strip() or '-'}".splitlines()[0]
