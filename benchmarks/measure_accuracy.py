@@ -29,6 +29,7 @@ PLANTS = ("gain", "integrator", "servo", "second order")
 COMMANDS = ("white", "smooth", "held", "policy")
 NOISES = (0.0, 0.01, 0.03, 0.1)
 TASKS = ("HalfCheetah-v5", "Hopper-v5", "Reacher-v5", "Ant-v5", "Pendulum-v1")
+WIDE = 4.5  # rows, of an interval at which the command warns
 METHODS = ("dead time", "increments", "levels")
 
 
@@ -187,10 +188,15 @@ def tables() -> None:
     late = [c["dead time"] - c["delay"] for c in own if c["dead time"] is not None]
     text = table([*groups, ("all", own)], "plant") + "\n\n"
     text += table([*tasks, ("all", [c for _, group in tasks for c in group])], "task, commands") + "\n\n"
+    found = [line for line in lines if line["plant"] != "unrelated" and line["dead time"] is not None]
+    wide = [line["high"] - line["low"] > WIDE for line in found]
+    wrong = [abs(line["dead time"] - line["delay"]) > 1.5 for line in found]
     text += (
         f"Of {len(unrelated)} logs of unrelated signals (half of them random walks) {alarms} showed a delay. On the "
         f"plants the dead time was too short in {np.mean(np.array(late) < -0.5):.0%} and too long in "
-        f"{np.mean(np.array(late) > 0.5):.0%} of the logs. {ROWS:,} rows each. "
+        f"{np.mean(np.array(late) > 0.5):.0%} of the logs. Of the {sum(wrong)} answers that "
+        f"were off by two rows or more {sum(np.logical_and(wide, wrong))} came with an interval so wide "
+        f"that the command warns, of the {len(found) - sum(wrong)} others {sum(np.logical_and(wide, np.logical_not(wrong)))}. "
         "Results: `benchmarks/results/measure.jsonl`."
     )
     page = PAGE.read_text()

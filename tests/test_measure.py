@@ -297,6 +297,19 @@ def log(path: Path, u: np.ndarray, y: np.ndarray, time: np.ndarray | None = None
     return write(path, {"time": ROW * np.arange(len(u)) if time is None else time, "command": u, "obs": y})
 
 
+def test_held_commands(tmp_path: Path) -> None:
+    """A command that is held for as long as the delay: one step's response falls on the next step's command."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1, 1, 200), 10)
+    for delay in (3, 9, 10, 11):
+        x, v, y = 0.0, 0.0, []
+        for t in range(len(u)):
+            y.append(x)
+            x, v = STEPS["servo"](x, v, u[t - delay] if t >= delay else 0.0)
+        e = from_log(log(tmp_path / "log.csv", u, np.array(y) + 0.002 * rng.normal(size=len(u))))
+        assert e.delay == pytest.approx(delay * ROW), delay
+
+
 @pytest.mark.parametrize("policy", [True, False])
 @pytest.mark.parametrize("plant", list(STEPS))
 def test_dead_time_of_plants(plant: str, policy: bool, tmp_path: Path) -> None:

@@ -214,6 +214,10 @@ def _show_log(e: Estimated, saved: Path | None) -> str:
             f"{'in steps of ' + ms(e.period):<26}{e.step}"
             + (f"; parts: {_shares(e.counts)}" if len(e.counts) > 1 else "")
         )
+        if e.high - e.low > 4.5 * e.row:
+            lines.append(
+                "The log does not settle it: the interval is wide. --plot shows what else is there; log more rows."
+            )
         if e.row > 0.6 * e.period:
             lines.append("Rows are as far apart as steps: up to one step more cannot be seen. Log faster to see it.")
     lines += ["", f"train with: --delay {e.train_with}"]

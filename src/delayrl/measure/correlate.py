@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 MEMORY = 10  # rows of the past in a model, fewer where the log is short for its width
 CHANCE = 1e-3  # that one of all lags of unrelated signals is taken for an onset
@@ -47,18 +48,24 @@ def increments(values: Array, episode: Array) -> Array:
 
 
 def innovations(commands: Array, observations: Array, episode: Array) -> tuple[Array, Array]:
-    """What is new in each row of both, standardised, [N, U] and [N, Y]; zero where an episode is too young to say."""
+    """What is new in each row of both, standardised, [N, U] and [N, Y]; zero where an episode is too young to say.
+
+    A command that is held for rows is news only where it changes: between changes there is nothing to be predicted.
+    """
     u, y = _standard(commands), _standard(observations)
-    size = u.shape[1] + y.shape[1]
-    memory = int(np.clip(len(u) // (20 * size), 1, MEMORY))
     whole = np.ones(len(u), bool)
     whole[:MEMORY] = False
     for back in range(1, MEMORY + 1):
         whole[back:] &= episode[back:] == episode[:-back]
-    both = np.concatenate([u, y], 1)
-    new_u = _unpredicted(u, np.concatenate([_past(both, memory), y], 1), whole)
-    new_y = np.concatenate([_unpredicted(y[:, [j]], _past(y[:, [j]], MEMORY), whole) for j in range(y.shape[1])], 1)
-    return _standard(new_u, whole), _standard(new_y, whole)
+    changes = np.diff(commands, axis=0, prepend=np.nan).any(1)
+    event: Mask = whole & changes if changes.mean() < 0.5 else whole
+    size = u.shape[1] + y.shape[1]
+    memory, for_y = (int(np.clip(rows.sum() // (20 * size), 1, MEMORY)) for rows in (event, whole))
+    new_u = _unpredicted(u, np.concatenate([_past(np.concatenate([u, y], 1), memory), y], 1), event)
+    others = _past(y, for_y)
+    own = [np.concatenate([_past(y[:, [j]], MEMORY), others], 1) for j in range(y.shape[1])]
+    new_y = np.concatenate([_unpredicted(y[:, [j]], own[j], whole) for j in range(y.shape[1])], 1)
+    return _standard(new_u, event) * (len(u) / max(int(event.sum()), 1)) ** 0.5, _standard(new_y, whole)
 
 
 def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, Array]:
@@ -147,7 +154,7 @@ def _past(values: Array, memory: int) -> Array:
     return np.concatenate([padded[memory - back : len(padded) - back] for back in range(1, memory + 1)], 1)
 
 
-def _unpredicted(target: Array, known: Array, whole: Array) -> Array:
+def _unpredicted(target: Array, known: Array, whole: Mask) -> Array:
     """Residual of a least-squares fit over the rows where `whole`; zero elsewhere."""
     rest = np.zeros_like(target)
     a, b = known[whole], target[whole]
@@ -158,7 +165,7 @@ def _unpredicted(target: Array, known: Array, whole: Array) -> Array:
     return rest
 
 
-def _standard(values: Array, counted: Array | None = None) -> Array:
+def _standard(values: Array, counted: Mask | None = None) -> Array:
     """Mean 0 and deviation 1 over the counted rows, outliers cut; columns that do not vary become zero."""
     chosen = values if counted is None else values[counted]
     spread = chosen.std(0)
