@@ -196,7 +196,8 @@ def tables() -> None:
         f"plants the dead time was too short in {np.mean(np.array(late) < -0.5):.0%} and too long in "
         f"{np.mean(np.array(late) > 0.5):.0%} of the logs. Of the {sum(wrong)} answers that "
         f"were off by two rows or more {sum(np.logical_and(wide, wrong))} came with an interval so wide "
-        f"that the command warns, of the {len(found) - sum(wrong)} others {sum(np.logical_and(wide, np.logical_not(wrong)))}. "
+        f"that the command warns, of the {len(found) - sum(wrong)} others "
+        f"{sum(np.logical_and(wide, np.logical_not(wrong)))}. "
         "Results: `benchmarks/results/measure.jsonl`."
     )
     page = PAGE.read_text()
