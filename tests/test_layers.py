@@ -9,6 +9,7 @@ SOURCE = Path(delayrl.__file__).parent
 ORDER = [
     "errors",
     "delays wrappers envs",
+    "measure",
     "types config",
     "views networks replay provenance",
     "objectives transformer",

@@ -56,6 +56,14 @@ def _run(arguments: list[str]) -> None:
     watch.add_argument("--delay", metavar="DELAY", help="another delay than the one it was trained for")
     watch.add_argument("--seed", type=int, default=0, help="of the start state (default: 0)")
 
+    measure = commands.add_parser("measure", help="measure the delay of an environment, or from a log")
+    if arguments[:1] == ["measure"]:
+        from delayrl.measure import command
+
+        command.add_options(measure)
+        command.run(parser.parse_args(arguments))
+        return
+
     commands.add_parser("agents", help="list the agents")
     commands.add_parser("tasks", help="list the tasks")
 

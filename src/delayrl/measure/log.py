@@ -1,0 +1,317 @@
+"""The delay of a running system from its log: exact where it says when observations were made, else by correlation."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from delayrl.errors import DelayRLError
+from delayrl.measure import correlate, reading
+from delayrl.measure.correlate import Array
+
+TOLERANCE = 1e-3  # of a step: a delay that exceeds whole steps by less is those whole steps, not one more
+BLOCKS = 40
+RESAMPLINGS = 200
+LEAST_ROWS = 200
+WINDOW_ROWS = 400  # at least, of a window of the log with an estimate of its own
+WINDOWS = 8
+WARM_UP = 0.05  # of the log, left out at its start where nobody says otherwise
+
+
+@dataclass(frozen=True)
+class Pair:
+    """How a command and an observation correlate, in increments: the largest |r|, and the lag where, in seconds."""
+
+    command: str
+    observation: str
+    lag: float
+    r: float
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """A delay in seconds, and in steps of a control period.
+
+    Attributes:
+        method: "stamps", exact and of each observation; or "correlation", estimated.
+        delay: correlation: the dead time, from a command to the first row that knows of it. stamps: the median.
+        low, high: correlation: the 95 % interval of a block bootstrap, and a row on each side. stamps: the 2.5th and
+            97.5th percentile.
+        row: spacing of the rows in seconds: the resolution of a correlation.
+        strength: of the strongest lag, as a multiple of what chance gives in one log of a thousand.
+        peak: pair with the largest correlation of increments: its lag has the plant's own lag in it.
+        pairs: the strongest pairs.
+        windows: (middle in seconds, dead time) of parts of the log that show one on their own.
+        steps: the delay of each window or observation, in steps, in order of time.
+        period: of control, in seconds.
+        warm_up: seconds left out at the start; rows: how many were used; slowest_warm_up: stamps only.
+        longest: the largest delay seen, of a window or of an observation.
+        curve: (dead time, strength, r of the best pair's increments) of every lag.
+        drift: stamps only: growth of the smallest delays, in parts per million: clocks that run apart.
+    """
+
+    method: str
+    path: str
+    delay: float
+    low: float
+    high: float
+    row: float
+    period: float
+    rows: int
+    warm_up: float
+    steps: tuple[int, ...]
+    step: int
+    strength: float | None = None
+    peak: Pair | None = None
+    pairs: tuple[Pair, ...] = ()
+    windows: tuple[tuple[float, float], ...] = ()
+    longest: float = 0.0
+    slowest_warm_up: float | None = None
+    drift: float | None = None
+    curve: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def train_with(self) -> str:
+        """What `delayrl train --delay` takes.
+
+        The steps; or `uniform:LOW:HIGH` where they vary. stamps: from the smallest to the 99th percentile; windows:
+        from the 10th to the 90th, because a window is short and its estimate is rough.
+        """
+        if len(self.steps) < (1 if self.method == "stamps" else 3):
+            return str(self.step)
+        bounds = (0.0, 0.99) if self.method == "stamps" else (0.1, 0.9)
+        low, high = (int(q) for q in np.quantile(self.steps, bounds, method="nearest"))
+        return str(high) if low == high else f"uniform:{low}:{high}"
+
+    @property
+    def counts(self) -> dict[int, int]:
+        """How many windows or observations had so many steps."""
+        return dict(sorted(Counter(self.steps).items()))
+
+    def save(self, path: Path) -> None:
+        """The steps, one a line, for `--delay recorded:FILE`."""
+        path.write_text("".join(f"{step}\n" for step in self.steps or (self.step,)))
+
+    def json(self) -> dict[str, Any]:
+        """For `json.dumps`."""
+        fields = {"kind": "log", **asdict(self), "train_with": self.train_with}
+        return fields | {"steps": {str(step): count for step, count in self.counts.items()}}
+
+
+def whole_steps(seconds: float, period: float) -> int:
+    """Delay in steps: rounded up, because an action that is still on its way must be remembered; see `TOLERANCE`."""
+    return max(0, int(np.ceil(seconds / period - TOLERANCE)))
+
+
+def from_log(
+    path: str | Path,
+    period: float | None = None,
+    *,
+    time: str | None = None,
+    commands: Sequence[str] | None = None,
+    observations: Sequence[str] | None = None,
+    episode: str | None = None,
+    stamp: str | None = None,
+    received: str | None = None,
+    unit: str = "s",
+    longest: float | None = None,
+    warm_up: float | None = None,
+    seed: int = 0,
+) -> Estimated:
+    """Estimate the delay from a log.
+
+    Args:
+        path: CSV or Parquet.
+        period: of control, in seconds; by default the spacing of the rows.
+        time: column of the time stamps; by default `time`, `timestamp` or `t`.
+        commands: columns, or how they begin; by default `command`, `cmd`, `action`.
+        observations: the same; by default `observation`, `obs`.
+        episode: column that changes where a new recording begins; by default `episode` or `episode_index`, if any.
+        unit: of time stamps: s, ms, us or ns.
+        stamp: column of the time when an observation was made, by default `stamp`. With `received` the delays are
+            exact, and commands are not looked at.
+        received: column of the time when it arrived, by default `received`.
+        longest: the longest delay that is looked for, in seconds; by default 100 rows, or a tenth of a short log.
+        warm_up: seconds to leave out at the start; by default a twentieth of the log.
+        seed: of the bootstrap.
+
+    Raises:
+        DelayRLError: the log cannot be used (the line says where), or shows no delay that is no chance.
+    """
+    path = Path(path)
+    if unit not in reading.UNITS:
+        raise DelayRLError(f"time stamps are in {', '.join(reading.UNITS)}; got {unit!r}")
+    for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
+        if value is not None and not (np.isfinite(value) and value >= least):
+            raise DelayRLError(f"--{name} is a time in seconds; got {value}")
+    exact = reading.read_stamps(path, stamp, received, unit)
+    if exact is not None:
+        return _from_stamps(path, *exact, period, warm_up)
+    log, row = reading.resample(reading.read_signals(path, time, commands, observations, episode, unit))
+    warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
+    return _correlated(path, log, row, period or row, longest, warm, seed)
+
+
+def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, warm_up: float | None) -> Estimated:
+    if len(made) < 10:
+        raise DelayRLError(f"{path} has {len(made)} rows: too short, at least 10 are needed")
+    delays, start = arrived - made, made - made[0]
+    if (np.diff(made) < 0).any():
+        row = int(np.argmax(np.diff(made) < 0)) + 2
+        raise DelayRLError(
+            f"{path}, row {row}: the stamp goes back; sort the rows by the time when observations were made"
+        )
+    if (np.diff(made) == 0).all():
+        raise DelayRLError(f"{path}: every observation has the same stamp")
+    if delays.min() < 0:
+        row = int(np.argmin(delays))
+        raise DelayRLError(
+            f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made, so the clocks differ by that at "
+            "least; synchronise them (PTP, NTP), or stamp both ends with one clock"
+        )
+    row_spacing = float(np.median(np.diff(made)))
+    warm = WARM_UP * float(start[-1]) if warm_up is None else warm_up
+    used = start >= warm
+    if used.sum() < 10:
+        raise DelayRLError(f"{path}: {used.sum()} rows are left after a warm-up of {warm:g} s: too few")
+    kept = delays[used]
+    period = period or row_spacing
+    edges = np.array_split(np.arange(len(kept)), min(10, len(kept) // 2))
+    floor = [(made[used][part].mean(), kept[part].min()) for part in edges]
+    times, least = np.array(floor).T
+    return Estimated(
+        method="stamps",
+        path=str(path),
+        delay=float(np.median(kept)),
+        low=float(np.quantile(kept, 0.025)),
+        high=float(np.quantile(kept, 0.975)),
+        row=row_spacing,
+        period=period,
+        rows=len(kept),
+        warm_up=warm,
+        steps=tuple(whole_steps(d, period) for d in kept),
+        step=whole_steps(float(np.median(kept)), period),
+        longest=float(kept.max()),
+        slowest_warm_up=float(delays[~used].max()) if (~used).any() else None,
+        drift=float(np.polyfit(times, least, 1)[0]) * 1e6,
+    )
+
+
+def _correlated(
+    path: Path, log: reading.Log, row: float, period: float, longest: float | None, warm: float, seed: int
+) -> Estimated:
+    used = log.time >= warm - row / 2
+    rows = int(used.sum())
+    if rows < LEAST_ROWS:
+        raise DelayRLError(
+            f"{path} is too short: {rows} rows after a warm-up of {warm:g} s; {LEAST_ROWS} are needed, better 1,000"
+        )
+    commands, observations, episode = log.commands[used], log.observations[used], log.episode[used]
+    for values, what in ((commands, "command"), (observations, "observation")):
+        if (values == values[0]).all():
+            raise DelayRLError(f"{path}: after a warm-up of {warm:g} s every {what} is constant")
+    lags = min(100, rows // 10) if longest is None else int(np.ceil(longest / row)) + 1
+    if lags > rows // 6:
+        raise DelayRLError(
+            f"{path}: {rows} rows of {row:g} s are too few to look for a delay of {lags * row:g} s: "
+            f"at most {rows // 6 * row:.3g} s"
+        )
+    u, y = correlate.innovations(commands, observations, episode)
+    blocks = int(np.clip(rows // (2 * lags), WINDOWS, BLOCKS)) // WINDOWS * WINDOWS  # windows are whole blocks
+    sums, sizes = correlate.blocks(u, y, lags, blocks)
+    whole = correlate.correlation(sums, sizes, lags)
+    first = correlate.onset(whole)
+    if first is None:
+        raise DelayRLError(
+            f"{path}: no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance. "
+            "A longer log, other columns, or commands with some random variation may show one"
+        )
+    random = np.random.default_rng(seed)
+    found = [correlate.onset(c) for c in correlate.resampled(sums, sizes, lags, RESAMPLINGS, random)]
+    again = [(lag - 1) * row for lag in found if lag is not None]
+    low, high = np.quantile(again, (0.025, 0.975)) if again else (0.0, lags * row)
+    low, high = max(0.0, low - row), high + row  # what lies between two rows is not seen
+    windows = []
+    count = min(WINDOWS, rows // WINDOW_ROWS)
+    for part in np.array_split(np.arange(len(sums)), count) if count > 1 else []:
+        lag = correlate.onset(correlate.correlation(sums[part], sizes[part], lags))
+        if lag is not None:
+            windows.append((float(warm + part.mean() * sizes[0] * row + sizes[0] * row / 2), (lag - 1) * row))
+    pairs, r = _pairs(log, commands, observations, episode, lags, row)
+    strength = correlate.strength(whole)[0]
+    delay = (first - 1) * row
+    return Estimated(
+        method="correlation",
+        path=str(path),
+        delay=delay,
+        low=float(low),
+        high=float(high),
+        row=row,
+        period=period,
+        rows=rows,
+        warm_up=warm,
+        steps=tuple(whole_steps(d, period) for _, d in windows),
+        step=whole_steps(delay, period),
+        strength=float(strength.max()),
+        peak=pairs[0],
+        pairs=pairs[:10],
+        windows=tuple(windows),
+        longest=max([delay, *(d for _, d in windows)]),
+        curve=tuple((lag * row, float(strength[lag]), float(r[lag])) for lag in range(lags)),
+    )
+
+
+def _pairs(
+    log: reading.Log, commands: Array, observations: Array, episode: Array, lags: int, row: float
+) -> tuple[tuple[Pair, ...], Array]:
+    """All pairs by the largest correlation of their increments, and the correlations of the first at lags 1..L."""
+    u, y = correlate.increments(commands, episode), correlate.increments(observations, episode)
+    sums, sizes = correlate.blocks(u, y, lags, 1)
+    near = correlate.correlation(sums, sizes, lags).near
+    pairs: list[tuple[Pair, Array]] = []
+    for i, command in enumerate(log.command_names):
+        for j, observation in enumerate(log.observation_names):
+            lag, r = correlate.peak(near[:, i, j])
+            pairs.append((Pair(command, observation, lag * row, r), near[:, i, j]))
+    pairs.sort(key=lambda pair: -abs(pair[0].r))
+    return tuple(pair for pair, _ in pairs), pairs[0][1]
+
+
+def plot(estimated: Estimated, out: Path) -> None:
+    """A picture, in the format of the file's ending: how far each lag is from chance; or how often each delay is.
+
+    Raises:
+        DelayRLError: for an ending that matplotlib does not know.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    if out.suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
+        pyplot.close(figure)
+        raise DelayRLError(f"--plot takes a .png, .svg or .pdf file; got {out}")
+    if estimated.method == "stamps":
+        axes.bar(list(estimated.counts), list(estimated.counts.values()), color="#1f6feb")
+        axes.set(xlabel=f"steps of {estimated.period * 1e3:g} ms", ylabel="observations")
+    else:
+        lag, strength, r = np.array(estimated.curve).T
+        axes.axvspan(estimated.low * 1e3, estimated.high * 1e3, color="#1a7f37", alpha=0.2, label="dead time, 95 %")
+        axes.axvline(estimated.delay * 1e3, color="#1a7f37")
+        axes.plot(lag * 1e3, strength, color="#1f6feb", marker=".", label="innovations, 1 = chance")
+        axes.set(xlabel="dead time, ms", ylabel="strength of the response", yscale="symlog", ylim=(0, None))
+        shown = 1e3 * max(4 * estimated.high, 2 * estimated.peak.lag if estimated.peak else 0)
+        axes.set(xlim=(0, min(shown, lag[-1] * 1e3)))
+        axes.axhline(1, color="#8c8c8c", linewidth=1, linestyle="--")
+        other = axes.twinx()
+        other.plot(lag * 1e3, np.abs(r), color="#d1242f", alpha=0.7, label="increments, |r| of the best pair")
+        other.set(ylabel="|r| of increments", ylim=(0, None))
+        lines = [*axes.get_legend_handles_labels()[0], *other.get_legend_handles_labels()[0]]
+        axes.legend(handles=lines, frameon=False)
+    axes.set(title=f"{Path(estimated.path).name}: train with --delay {estimated.train_with}")
+    figure.savefig(out, dpi=130)
+    pyplot.close(figure)
