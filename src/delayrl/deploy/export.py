@@ -7,7 +7,7 @@ import numpy as np
 import safetensors.numpy
 from gymnasium.spaces import Box
 
-from delayrl.deploy.bundle import GRAPH, WEIGHTS, check_files, seal, write_files
+from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, seal, write_files
 from delayrl.deploy.network import Arrays, Network
 from delayrl.deploy.onnx_graph import onnx_graph
 from delayrl.envs import make

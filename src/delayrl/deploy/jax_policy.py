@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl import networks
-from delayrl.deploy.bundle import Act
-from delayrl.deploy.network import Arrays, Network
+from delayrl.deploy.network import Act, Arrays, Network
 from delayrl.transformer import transformer
 
 

@@ -1,7 +1,7 @@
 """What network a bundle holds: a description in plain numbers, and the arrays that it asks for."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from delayrl.errors import DelayRLError
 
 Arrays = Mapping[str, NDArray[np.float32]]
+Act = Callable[[NDArray[np.float32], NDArray[np.float32], int], NDArray[np.float32]]
+"""obs [S], actions [Δ, A] in the task's units, age -> action [A] in the task's units."""
 INPUTS = ("observation", "augmented", "transformer")
 
 

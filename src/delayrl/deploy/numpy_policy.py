@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.deploy.bundle import Act
-from delayrl.deploy.network import Arrays, Network
+from delayrl.deploy.network import Act, Arrays, Network
 
 Array = NDArray[Any]
 """Always of float32 here."""

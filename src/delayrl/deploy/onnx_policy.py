@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.deploy.bundle import Act
-from delayrl.deploy.network import Network
+from delayrl.deploy.network import Act, Network
 from delayrl.errors import DelayRLError
 
 
