@@ -232,9 +232,8 @@ def _pull(given: argparse.Namespace) -> None:
     from delayrl.deploy.hub import plain, pull
 
     metadata = pull(given.repo, given.out, revision=given.revision, force=given.force)
-    print(
-        f"{given.out}: {plain(metadata.get('agent'))} on {plain(metadata.get('env'))}, ages 0..{metadata['policy']['max_age']}"
-    )
+    agent, env, longest = plain(metadata.get("agent")), plain(metadata.get("env")), metadata["policy"]["max_age"]
+    print(f"{given.out}: {agent} on {env}, ages 0..{longest}")
 
 
 def _agents(given: Any) -> None:

@@ -1,4 +1,4 @@
-"""The files of a policy bundle: a folder with a policy's weights and what must be known to use them. Files are data, none is code.
+"""The files of a policy bundle: weights, and what must be known to use them. They are data, none is code.
 
 ```
 bundle.json          network, task, delay, evaluation; sizes and SHA-256 sums of the files below; its own sum

@@ -62,6 +62,8 @@ def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | Non
     policy = load_bundle(bundle, backend)
     random, rows = np.random.default_rng(0), []
     for age in ages_of(policy.max_age) if ages is None else ages:
+        if not 0 <= age <= policy.max_age:
+            raise DelayRLError(f"the policy was trained for ages 0..{policy.max_age}; got {age}")
         taken = np.zeros(decisions)
         for i in range(-WARM_UP, decisions):
             obs = random.standard_normal(policy.obs_size, np.float32)
