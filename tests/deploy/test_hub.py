@@ -1,12 +1,16 @@
-"""push and pull against a hub that is a folder. Its calls must fit the signatures of the real client."""
+"""push and pull with the real client, against a hub on this machine whose repositories are folders."""
 
-import inspect
+import base64
+import hashlib
+import http.server
 import json
 import pickle
-import shutil
+import threading
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from urllib.parse import parse_qs
 
 import huggingface_hub
 import pytest
@@ -18,50 +22,95 @@ from delayrl.deploy.files import LIMITS, WEIGHTS
 from delayrl.deploy.hub import card, pull, push
 from delayrl.errors import DelayRLError
 
-Real = huggingface_hub.HfApi
+COMMIT = "0123456789" * 4
 
 
-class Hub:
-    """Repositories are folders below `root`."""
+class Hub(http.server.ThreadingHTTPServer):
+    """What it keeps, and what it was asked for."""
 
     root: Path
     asked: list[str]
     sizes: dict[str, int]
+    private: bool
 
-    def _fits(self, method: str, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        return inspect.signature(getattr(Real, method)).bind(self, *args, **kwargs).arguments
 
-    def create_repo(self, *args: Any, **kwargs: Any) -> str:
-        given = self._fits("create_repo", *args, **kwargs)
-        huggingface_hub.utils.validate_repo_id(given["repo_id"])
-        (self.root / given["repo_id"]).mkdir(parents=True, exist_ok=given["exist_ok"])
-        return f"https://hub.example/{given['repo_id']}"
+class Handler(http.server.BaseHTTPRequestHandler):
+    """As much of the hub's interface as pushing and pulling need."""
 
-    def create_commit(self, *args: Any, **kwargs: Any) -> None:
-        given = self._fits("create_commit", *args, **kwargs)
-        for operation in given["operations"]:
-            with operation.as_file() as file:
-                (self.root / given["repo_id"] / operation.path_in_repo).write_bytes(file.read())
+    server: Hub
 
-    def get_paths_info(self, *args: Any, **kwargs: Any) -> list[Any]:
-        given = self._fits("get_paths_info", *args, **kwargs)
-        home = self.root / given["repo_id"]
+    def log_message(self, *args: Any) -> None:
+        pass
+
+    def reply(self, status: int, content: Any, **headers: str) -> None:
+        data = content if isinstance(content, bytes) else json.dumps(content).encode()
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(data)
+
+    def do_POST(self) -> None:
+        hub, body = self.server, self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        parts = self.path.strip("/").split("/")
+        if self.path == "/api/repos/create":
+            given = json.loads(body)
+            hub.private = given.get("private") is True or given.get("visibility") == "private"
+            repo = f"{given['organization']}/{given['name']}"
+            (hub.root / repo).mkdir(parents=True, exist_ok=True)
+            self.reply(200, {"url": f"http://127.0.0.1:{hub.server_port}/{repo}"})
+            return
+        if self.path == "/api/validate-yaml":  # the hub reads the head of a model card before it takes it
+            self.reply(200, {"errors": [], "warnings": []})
+            return
+        home = hub.root / "/".join(parts[2:4])
         if not home.is_dir():
-            raise OSError(f"404 Client Error: no repository {given['repo_id']}\nand a second line")
-        files = [home / name for name in given["paths"] if (home / name).exists()]
-        return [SimpleNamespace(path=f.name, size=self.sizes.get(f.name, f.stat().st_size)) for f in files]
+            self.reply(404, {"error": "no such repository"}, X_Error_Code="RepoNotFound")
+        elif parts[4] == "preupload":
+            files = json.loads(body)["files"]
+            modes = [{"path": f["path"], "uploadMode": "regular", "shouldIgnore": False} for f in files]
+            self.reply(200, {"files": modes})
+        elif parts[4] == "commit":
+            for line in map(json.loads, body.splitlines()):
+                if line["key"] == "file":
+                    (home / line["value"]["path"]).write_bytes(base64.b64decode(line["value"]["content"]))
+            url = f"http://127.0.0.1:{hub.server_port}/{'/'.join(parts[2:4])}/commit/{COMMIT}"
+            self.reply(200, {"commitOid": COMMIT, "commitUrl": url, "success": True})
+        elif parts[4] == "paths-info":
+            names = parse_qs(body.decode())["paths"]
+            files = [home / name for name in names if (home / name).is_file()]
+            sizes = {file.name: hub.sizes.get(file.name, file.stat().st_size) for file in files}
+            self.reply(200, [{"type": "file", "path": n, "size": s, "oid": "0" * 40} for n, s in sizes.items()])
+        else:
+            self.reply(404, {"error": "not found"})
 
-    def hf_hub_download(self, *args: Any, **kwargs: Any) -> str:
-        given = self._fits("hf_hub_download", *args, **kwargs)
-        self.asked.append(given["filename"])
-        return shutil.copy(self.root / given["repo_id"] / given["filename"], given["local_dir"])
+    def do_GET(self) -> None:
+        hub, parts = self.server, self.path.strip("/").split("/")
+        file = hub.root / "/".join(parts[:2]) / "/".join(parts[4:])
+        if parts[2:4] not in (["resolve", "main"], ["resolve", COMMIT]) or not file.is_file():
+            self.reply(404, {"error": "not found"}, X_Error_Code="EntryNotFound")
+            return
+        if self.command == "GET":
+            hub.asked.append(file.name)
+        data = file.read_bytes()
+        self.reply(200, data, ETag=f'"{hashlib.sha256(data).hexdigest()}"', X_Repo_Commit=COMMIT)
+
+    do_HEAD = do_GET  # noqa: N815
 
 
 @pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> type[Hub]:
-    Hub.root, Hub.asked, Hub.sizes = tmp_path / "hub", [], {}
-    monkeypatch.setattr(huggingface_hub, "HfApi", Hub)
-    return Hub
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    server = Hub(("127.0.0.1", 0), Handler)
+    server.root, server.asked, server.sizes, server.private = tmp_path / "hub", [], {}, False
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    client = partial(huggingface_hub.HfApi, endpoint=f"http://127.0.0.1:{server.server_port}", token="none")
+    monkeypatch.setattr(huggingface_hub, "HfApi", client)
+    monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    yield server
+    server.shutdown()
+    server.server_close()
 
 
 @pytest.fixture
@@ -70,9 +119,9 @@ def bundle(tmp_path: Path) -> Path:
     return bundle_of(tmp_path / "bundle", policy_of("vdpo"), evaluation=evaluation, agent="vdpo")
 
 
-def test_there_and_back(hub: type[Hub], bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_there_and_back(hub: Hub, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["push", str(bundle), "some/pendulum"])
-    assert "https://hub.example/some/pendulum" in capsys.readouterr().out
+    assert f"http://127.0.0.1:{hub.server_port}/some/pendulum" in capsys.readouterr().out
     (hub.root / "some/pendulum/evil.pkl").write_bytes(b"not asked for")
     main(["pull", "some/pendulum", "--out", str(tmp_path / "back")])
     assert "vdpo on Reacher-v5, ages 0..4" in capsys.readouterr().out
@@ -84,8 +133,9 @@ def test_there_and_back(hub: type[Hub], bundle: Path, tmp_path: Path, capsys: py
     load_bundle(tmp_path / "back", "onnx")
 
 
-def test_card(hub: type[Hub], bundle: Path) -> None:
+def test_card(hub: Hub, bundle: Path) -> None:
     push(bundle, "some/pendulum", private=True)
+    assert hub.private
     text = (hub.root / "some/pendulum/README.md").read_text()
     head = text.split("---")[1]
     assert 'library_name: "delayrl"' in head
@@ -106,14 +156,14 @@ def test_cards_are_text() -> None:
     assert max(map(len, text.splitlines())) < 500
 
 
-def test_a_bundle_that_is_broken_is_not_pushed(hub: type[Hub], bundle: Path) -> None:
+def test_a_bundle_that_is_broken_is_not_pushed(hub: Hub, bundle: Path) -> None:
     (bundle / WEIGHTS).write_bytes(b"")
     with pytest.raises(DelayRLError, match="cut or changed"):
         push(bundle, "some/pendulum")
     assert not hub.root.exists()
 
 
-def test_what_is_broken_does_not_arrive(hub: type[Hub], bundle: Path, tmp_path: Path) -> None:
+def test_what_is_broken_does_not_arrive(hub: Hub, bundle: Path, tmp_path: Path) -> None:
     """Nothing is left in the target, nor beside it, and no local path stands in the message."""
     push(bundle, "some/pendulum")
     home, out = hub.root / "some/pendulum", tmp_path / "back"
@@ -145,7 +195,7 @@ def test_what_is_broken_does_not_arrive(hub: type[Hub], bundle: Path, tmp_path: 
     refused("some/pendulum holds no policy bundle")
 
 
-def test_pull_overwrites_nothing(hub: type[Hub], bundle: Path, tmp_path: Path) -> None:
+def test_pull_overwrites_nothing(hub: Hub, bundle: Path, tmp_path: Path) -> None:
     push(bundle, "some/pendulum")
     out = tmp_path / "out"
     out.mkdir()
@@ -159,9 +209,9 @@ def test_pull_overwrites_nothing(hub: type[Hub], bundle: Path, tmp_path: Path) -
     pull("some/pendulum", bundle, force=True)
 
 
-def test_the_hub_says_no(hub: type[Hub], bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_hub_says_no(hub: Hub, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command, words in (
-        (["pull", "some/where", "--out", str(tmp_path / "back")], "404 Client Error: no repository some/where"),
+        (["pull", "some/where", "--out", str(tmp_path / "back")], "cannot pull from some/where: "),
         (["push", str(bundle), "not a name"], "cannot push to not a name: "),
     ):
         with pytest.raises(SystemExit) as end:
