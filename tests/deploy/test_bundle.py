@@ -307,12 +307,17 @@ def test_foreign_graphs(bundle: Path, tmp_path: Path) -> None:
         ((other / GRAPH).read_bytes(), "other actions than the weights"),
         (constant.SerializeToString(), "other actions than the weights"),
         (renamed.SerializeToString(), "inputs and outputs"),
-        (external.SerializeToString(), "cannot load"),
+        (external.SerializeToString(), "refers to another file"),
         (custom.SerializeToString(), "cannot load"),
     ]:
         forge(bundle, graph=data)
         refused(bundle, words, "onnx")
         load_bundle(bundle)  # its weights are those that were exported
+
+
+def test_a_word_in_the_metadata_is_not_a_reference(tmp_path: Path) -> None:
+    path = bundle_of(tmp_path / "bundle", policy_of("bpql"), env="some/relocation-v0")
+    assert load_bundle(path, "onnx").metadata["env"] == "some/relocation-v0"
 
 
 def test_without_a_graph(bundle: Path) -> None:

@@ -91,7 +91,8 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR,
     )
-    helper.set_model_props(model, {"delayrl": json.dumps(metadata, sort_keys=True)})
+    told = json.dumps(metadata, sort_keys=True).replace("location", "l\\u006fcation")  # see onnx_policy.LOCATION
+    helper.set_model_props(model, {"delayrl": told})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
 

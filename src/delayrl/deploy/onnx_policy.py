@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from delayrl.deploy.network import Act, Network
 from delayrl.errors import DelayRLError
 
+LOCATION = b"location"
+"""The key by which a graph names another file for its numbers. Older versions of onnxruntime would read any file."""
+
 
 def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
     """A function of (obs [S], actions [Δ, A], age), as `Bundle` has it.
@@ -22,6 +25,9 @@ def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    if LOCATION in model:
+        raise DelayRLError("it refers to another file")
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own exceptions have no common name
