@@ -67,6 +67,7 @@ def test_whole_bundles_load(bundle: Path) -> None:
         (np.zeros(10), np.zeros((3, 2)), 0, "history of shape (4, 2); got (3, 2)"),
         (np.zeros(10), np.zeros((4, 2)), 5, "ages 0..4; got 5"),
         (np.zeros(10), np.zeros((4, 2)), -1, "ages 0..4; got -1"),
+        (np.zeros(10), np.zeros((4, 2)), 1.5, "whole steps; got 1.5"),
         (np.full(10, np.nan), np.zeros((4, 2)), 0, "not a finite number"),
         (np.full(10, np.inf), np.zeros((4, 2)), 3, "not a finite number"),
         (np.zeros(10), np.full((4, 2), np.nan), 1, "not a finite number"),

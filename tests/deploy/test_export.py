@@ -120,6 +120,14 @@ def test_nothing_else_is_overwritten(run: Path, tmp_path: Path, capsys: pytest.C
     assert (full / "policy.onnx").read_text() == file.read_text() == "mine"
 
 
+def test_out_may_be_here(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    export_run(run, ".")
+    load_bundle(".")
+    assert [file.name for file in tmp_path.iterdir()] == ["here"]
+
+
 def test_force_replaces_a_bundle_and_follows_no_link(run: Path, tmp_path: Path) -> None:
     out, outside = bundle_of(tmp_path / "bundle", policy_of("bpql")), tmp_path / "outside"
     outside.write_text("mine")

@@ -1,5 +1,6 @@
 """A bundle, ready to act: `load_bundle` reads and checks its files, `Bundle` is the policy."""
 
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,10 @@ class Bundle:
         Raises:
             DelayRLError: wrong sizes, an age that was not trained, or numbers that are not finite.
         """
+        try:
+            age = operator.index(age)
+        except TypeError:
+            raise DelayRLError(f"an age counts whole steps; got {age!r}") from None
         obs, actions = np.asarray(obs, np.float32), np.asarray(actions, np.float32)
         if obs.shape != (self.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.obs_size}; got shape {obs.shape}")
@@ -61,7 +66,7 @@ class Bundle:
         if not (np.isfinite(obs).all() and np.isfinite(actions[:age]).all()):
             raise DelayRLError("the policy was given an observation or an action that is not a finite number")
         with np.errstate(all="ignore"):
-            action = self._act(obs, actions, int(age))
+            action = self._act(obs, actions, age)
         if not np.isfinite(action).all():
             raise DelayRLError("the policy was given numbers so large that its action is not finite")
         return action

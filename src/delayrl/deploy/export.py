@@ -31,9 +31,9 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict
     Raises:
         DelayRLError: no run, an agent without a deterministic policy, a folder that holds something else.
     """
-    source = Run(Path(run))
-    metadata = describe(source)
-    write_files(Path(out), bundle_files(load(run), metadata), force=force)
+    policy = load(run)
+    metadata = describe(Run(Path(run)), policy.spec.delay)
+    write_files(Path(out), bundle_files(policy, metadata), force=force)
     return metadata
 
 
@@ -83,10 +83,10 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     return network, arrays
 
 
-def describe(run: Run) -> dict[str, Any]:
+def describe(run: Run, longest: int) -> dict[str, Any]:
     """All that a bundle says of its run: task, spaces, seconds a step, delay, training, and the last evaluation."""
     config, step = run.config, run.latest().step
-    env = make(config["env"], config["delay"])
+    env = make(config["env"])
     observations, actions = env.observation_space, env.action_space
     assert isinstance(observations, Box)
     assert isinstance(actions, Box)
@@ -95,7 +95,7 @@ def describe(run: Run) -> dict[str, Any]:
     kept = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
         **{name: config.get(name) for name in kept},
-        "ages": [0, env.law.maximum],
+        "ages": [0, longest],
         "dt": float(dt) if isinstance(dt, int | float | np.floating) else None,
         "observation": _space(observations),
         "action": _space(actions),

@@ -104,7 +104,8 @@ def write_files(out: Path, files: Mapping[str, bytes], *, force: bool = False) -
                 raise DelayRLError(f"{out} is not empty; give another --out, or --force to replace a bundle in it")
             if any(out.iterdir()) and not (out / DOCUMENT).is_file():
                 raise DelayRLError(f"{out} is not empty and holds no bundle; give another --out")
-        draft = out.with_name(f".{out.name}.{os.getpid()}.draft")
+        home = out.resolve()  # "." has no name
+        draft = home.with_name(f".{home.name}.{os.getpid()}.draft")
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir(parents=True)
         try:
@@ -113,12 +114,12 @@ def write_files(out: Path, files: Mapping[str, bytes], *, force: bool = False) -
                     file.write(data)
                     file.flush()
                     os.fsync(file.fileno())
-            out.mkdir(exist_ok=True)
+            home.mkdir(exist_ok=True)
             for name in (WEIGHTS, GRAPH):
                 if name not in files:
-                    (out / name).unlink(missing_ok=True)
+                    (home / name).unlink(missing_ok=True)
             for name in sorted(files, key=lambda name: name == DOCUMENT):  # last: until then the sums do not hold
-                os.replace(draft / name, out / name)
+                os.replace(draft / name, home / name)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
     except OSError as error:
