@@ -30,6 +30,7 @@ from delayrl.types import Spec
 
 ROWS = HERE / "results" / "latency.jsonl"
 SIZES, DT, DELAYS, NAMES = (17, 6), 0.05, (5, 25, 50), ("vdpo", "bpql")
+KEYS = ("p50", "p99", "max", "processor_p99")
 WORDS = {"numpy": "NumPy", "onnx": "ONNX Runtime", "jax": "JAX", "cpp": "C++ example"}
 
 
@@ -46,7 +47,7 @@ def in_cpp(program: Path, bundle: Path, delay: int, decisions: int) -> dict[str,
     pin = ["taskset", "-c", str(max(os.sched_getaffinity(0)))] if shutil.which("taskset") else []
     command = [*pin, str(program), str(bundle), "--latency", str(decisions), str(delay)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return dict(zip(("p50", "p99", "max"), map(float, done.stdout.split()), strict=True))
+    return dict(zip(KEYS, map(float, done.stdout.split()), strict=True))
 
 
 def measure(tries: int, decisions: int) -> None:
@@ -76,7 +77,7 @@ def measure(tries: int, decisions: int) -> None:
                 common = {"try": number, "agent": name, "delay": delay, "load": round(os.getloadavg()[0], 2)}
                 for backend in BACKENDS:
                     (row,) = latency(bundle, backend, decisions=decisions, ages=[delay])
-                    lines.append(common | {"backend": backend, **{k: round(row[k], 4) for k in ("p50", "p99", "max")}})
+                    lines.append(common | {"backend": backend, **{k: round(row[k], 4) for k in KEYS}})
                 if compiler:
                     lines.append(common | {"backend": "cpp", **in_cpp(program, bundle, delay, decisions)})
             print(f"try {number + 1} of {tries} done")
@@ -86,7 +87,7 @@ def measure(tries: int, decisions: int) -> None:
 def table() -> str:
     """Markdown: medians over the tries, with the lowest and highest beside them."""
     head, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
-    lines = ["| policy | Δ | backend | p50 ms | p99 ms | max ms | p99 of the period |", "|" + " --- |" * 7]
+    lines = ["| policy | Δ | backend | p50 ms | p99 ms | max ms | p99 of processor time, ms |", "|" + " --- |" * 7]
     for name in NAMES:
         for delay in DELAYS:
             for backend in WORDS:
@@ -94,17 +95,16 @@ def table() -> str:
                 if not found:
                     continue
                 cells = [f"`{name}`", delay, WORDS[backend]]
-                for key in ("p50", "p99", "max"):
+                for key in KEYS:
                     values = [row[key] for row in found]
                     cells.append(f"{np.median(values):.2f} ({min(values):.2f}–{max(values):.2f})")
-                cells.append(f"{np.median([row['p99'] for row in found]) / (1000 * head['dt']):.1%}")
                 lines.append("| " + " | ".join(map(str, cells)) + " |")
     package, tries = head["versions"], 1 + max(row["try"] for row in rows)
     loads = [row["load"] for row in rows]
     lines += [
         "",
-        f"Preset `paper`, {SIZES[0]} observations, {SIZES[1]} actions, age Δ, fresh weights; control period "
-        f"{1000 * head['dt']:g} ms. Median of {tries} tries of {head['decisions']:,} decisions each (lowest–highest), "
+        f"Preset `paper`, {SIZES[0]} observations, {SIZES[1]} actions, age Δ, fresh weights; the task's control "
+        f"period is {1000 * head['dt']:g} ms. Median of {tries} tries of {head['decisions']:,} decisions each (lowest–highest), "
         f"back to back, on one thread of one core of a machine with {package['cores']} shared x86 cores and no GPU "
         f"(load average {min(loads):.1f}–{max(loads):.1f} meanwhile). NumPy {package['numpy']}, onnxruntime "
         f"{package.get('onnxruntime', '-')}, jax {package['jax']}, g++ {package.get('compiler', '-')} with "
