@@ -40,8 +40,8 @@ def latency(
         ages: which; None for `ages_of` the bundle's longest.
 
     Returns:
-        For each age `age`, `decisions`, `p50`, `p99`, `max`, and `processor_p99`, in milliseconds. The last one leaves out
-        the time in which the processor did something else: on a machine with other work it says what the decision costs.
+        For each age `age`, `decisions`, `p50`, `p99`, `max`, and `processor_p99`, in milliseconds. The last one leaves
+        out the time in which the processor did something else.
 
     Raises:
         DelayRLError: a broken bundle, an age that it does not serve, or a backend that is not installed.
