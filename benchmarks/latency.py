@@ -106,7 +106,8 @@ def table() -> str:
         f"Preset `paper`, {SIZES[0]} observations, {SIZES[1]} actions, age Δ, fresh weights; the task's control "
         f"period is {1000 * head['dt']:g} ms. Median of {tries} tries of {head['decisions']:,} decisions each "
         f"(lowest–highest), back to back, on one thread of one core of a machine with {package['cores']} shared x86 "
-        f"cores and no GPU (load average {min(loads):.1f}–{max(loads):.1f} meanwhile). NumPy {package['numpy']}, onnxruntime "
+        f"cores and no GPU (load average {min(loads):.1f}–{max(loads):.1f} meanwhile). "
+        f"NumPy {package['numpy']}, onnxruntime "
         f"{package.get('onnxruntime', '-')}, jax {package['jax']}, g++ {package.get('compiler', '-')} with "
         f"`-O3 -march=native`. Rows: `benchmarks/results/latency.jsonl`.",
     ]
