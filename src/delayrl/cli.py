@@ -57,12 +57,29 @@ def _run(arguments: list[str]) -> None:
     watch.add_argument("--seed", type=int, default=0, help="of the start state (default: 0)")
 
     measure = commands.add_parser("measure", help="measure the delay of an environment, or from a log")
-    if arguments[:1] == ["measure"]:
-        from delayrl.measure import command
 
-        command.add_options(measure)
-        command.run(parser.parse_args(arguments))
-        return
+    export = commands.add_parser("export", help="write a run's policy as a bundle, for use without JAX")
+    export.add_argument("run", type=Path, help="the run folder")
+    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    export.add_argument("--force", action="store_true", help="replace a bundle that lies there")
+
+    latency = commands.add_parser("latency", help="measure how long one decision of a bundle takes")
+    latency.add_argument("bundle", type=Path, help="its folder")
+    latency.add_argument("--period", type=float, metavar="MS", help="the control period (default: the task's step)")
+    latency.add_argument("--backend", choices=["numpy", "onnx", "jax"], help="(default: all that are installed)")
+    latency.add_argument("--ages", type=int, nargs="+", metavar="N", help="(default: 5, 25, 50 and the longest)")
+    latency.add_argument("--decisions", type=int, default=2000, metavar="N", help="for each age (default: 2000)")
+
+    push = commands.add_parser("push", help="upload a bundle to the Hugging Face Hub")
+    push.add_argument("bundle", type=Path, help="its folder")
+    push.add_argument("repo", help="OWNER/NAME")
+    push.add_argument("--private", action="store_true", help="where the repository is new")
+
+    pull = commands.add_parser("pull", help="download a bundle from the Hugging Face Hub, and check it")
+    pull.add_argument("repo", help="OWNER/NAME")
+    pull.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    pull.add_argument("--revision", help="a branch, tag or commit")
+    pull.add_argument("--force", action="store_true", help="replace a bundle that lies there")
 
     commands.add_parser("agents", help="list the agents")
     commands.add_parser("tasks", help="list the tasks")
@@ -70,8 +87,23 @@ def _run(arguments: list[str]) -> None:
     if arguments[:1] == ["train"]:
         _train(arguments[1:])
         return
+    if arguments[:1] == ["measure"]:
+        from delayrl.measure import command
+
+        command.add_options(measure)
+        command.run(parser.parse_args(arguments))
+        return
     given = parser.parse_args(arguments)
-    {"evaluate": _evaluate, "watch": _watch, "agents": _agents, "tasks": _tasks}[given.command](given)
+    {
+        "evaluate": _evaluate,
+        "watch": _watch,
+        "export": _export,
+        "latency": _latency,
+        "push": _push,
+        "pull": _pull,
+        "agents": _agents,
+        "tasks": _tasks,
+    }[given.command](given)
 
 
 def _train(arguments: list[str]) -> None:
@@ -192,6 +224,43 @@ def _watch(given: argparse.Namespace) -> None:
 
     frames, total = watch(given.run, given.out, given.delay, given.seed)
     print(f"{given.out}: {frames} frames, return {total:.1f}")
+
+
+def _export(given: argparse.Namespace) -> None:
+    from delayrl.deploy.export import export_run
+
+    metadata = export_run(given.run, given.out, force=given.force)
+    print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages 0..{metadata['ages'][1]}")
+    print(f"  next                     delayrl latency {given.out}")
+
+
+def _latency(given: argparse.Namespace) -> None:
+    from delayrl.deploy.bundle import BACKENDS, load_bundle
+    from delayrl.deploy.latency import available, latency, table
+
+    policy = load_bundle(given.bundle)
+    period = given.period if given.period is not None else policy.dt and 1000 * policy.dt
+    if period is not None and not 0 < period < float("inf"):
+        raise DelayRLError(f"--period takes milliseconds above 0; got {period:g}")
+    chosen = [given.backend] if given.backend else [name for name in BACKENDS if available(name)]
+    rows = {name: latency(given.bundle, name, decisions=given.decisions, ages=given.ages) for name in chosen}
+    _table(*table(rows, period))
+    told = f"control period {period:g} ms" if period else "control period unknown: give --period MS"
+    print(f"\n{given.decisions:,} decisions each, back to back, on one thread of one core; {told}")
+
+
+def _push(given: argparse.Namespace) -> None:
+    from delayrl.deploy.hub import push
+
+    print(push(given.bundle, given.repo, private=given.private))
+
+
+def _pull(given: argparse.Namespace) -> None:
+    from delayrl.deploy.hub import plain, pull
+
+    metadata = pull(given.repo, given.out, revision=given.revision, force=given.force)
+    agent, env, longest = plain(metadata.get("agent")), plain(metadata.get("env")), metadata["policy"]["max_age"]
+    print(f"{given.out}: {agent} on {env}, ages 0..{longest}")
 
 
 def _agents(given: Any) -> None:

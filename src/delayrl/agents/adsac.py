@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from delayrl import networks
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Phase
+from delayrl.agents.base import Agent, Deterministic, Phase
 from delayrl.errors import DelayRLError
 from delayrl.networks import Params
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
@@ -100,6 +100,10 @@ class ADSAC:
         assert truth is not None, "behaviour with the auxiliary actor is privileged"
         auxiliary, _ = networks.sample(self.learner.policy(state.auxiliary.actor, truth), auxiliary_key)
         return networks.lower_q(state.auxiliary.critic, truth, auxiliary, augmented)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """The augmented actor, its mode: also where `evaluation` samples."""
+        return Deterministic("augmented", state.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One critic update; every `actor_every`-th time rounds of a coin's choice of actor, and both temperatures."""

@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 
 from delayrl.networks import Params
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.views import Sees
 
 State = Any
 """An agent's state: a tree of arrays; networks, optimisers, temperatures."""
@@ -27,6 +28,20 @@ class Phase(NamedTuple):
     updates: int
     batch: int
     update: Callable[[State, Window, Key, Int[Array, ""]], tuple[State, Metrics]]
+
+
+class Deterministic(NamedTuple):
+    """What gives an agent's deterministic actions, as plain networks: for whoever runs them without the agent.
+
+    The action is tanh of the first A outputs of `head`, an `mlp`. It reads the observation that is shown, or x_t as
+    `network_input` makes it; or, with an `encoder`, what a `transformer` on x_t gives at the shown age. At age 0
+    `current`, where there is one, acts instead: an `mlp` on the observation.
+    """
+
+    sees: Sees
+    head: Params
+    encoder: Params | None = None
+    current: Params | None = None
 
 
 @runtime_checkable
@@ -62,6 +77,10 @@ class Agent(Protocol):
 
     def reference_policy(self, state: State) -> "tuple[Agent, State] | None":
         """The delay-free policy inside it, where there is one: evaluated beside it, without delay."""
+        ...
+
+    def deterministic(self, state: State) -> Deterministic:
+        """The networks that `act` without `explore` consists of. Raises DelayRLError where there are none."""
         ...
 
 

@@ -23,7 +23,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from delayrl import networks
-from delayrl.agents.base import Agent, Phase, descend
+from delayrl.agents.base import Agent, Deterministic, Phase, descend
 from delayrl.errors import DelayRLError
 from delayrl.networks import Gaussian, Params
 from delayrl.objectives import k_step_return, soft_target
@@ -98,6 +98,10 @@ class DCAC:
         """A sample of the policy, or its mode."""
         policy = self.policy(state.actor, network_input(seen, "augmented"))
         return networks.sample(policy, key)[0] if explore else networks.mode(policy)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """The actor."""
+        return Deterministic("augmented", state.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One step of actor and critics together; then of the targets."""

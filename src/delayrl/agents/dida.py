@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from delayrl import networks
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Phase, Schedule, descend
+from delayrl.agents.base import Agent, Deterministic, Phase, Schedule, descend
 from delayrl.errors import DelayRLError
 from delayrl.networks import Params
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
@@ -108,6 +108,10 @@ class DIDA:
         assert seen.truth is not None, "behaviour with the expert is privileged"
         expert = self.reference.act(state.reference, seen._replace(obs=seen.truth), key, explore=True)
         return jnp.where(state.steps < self.expert_steps, expert, student)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """The student."""
+        return Deterministic("augmented", state.student)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """SAC's update of the expert, up to `expert_steps`; `count` is the environment step, the same for all seeds."""

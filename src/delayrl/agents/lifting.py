@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Phase, Schedule
+from delayrl.agents.base import Agent, Deterministic, Phase, Schedule
 from delayrl.errors import DelayRLError
 from delayrl.networks import Gaussian
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
@@ -87,6 +87,10 @@ class Lifting:
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """A sample of the delayed policy, or its mode."""
         return self.bpql.act(state.delayed, seen, key, explore=explore)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """The delayed policy."""
+        return self.bpql.deterministic(state.delayed)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """SAC's update of the reference, then BPQL's with the lifting loss; both on the same batch."""

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from delayrl.agents.base import Agent, Phase
+from delayrl.agents.base import Agent, Deterministic, Phase
+from delayrl.errors import DelayRLError
 from delayrl.types import Action, Key, Seen, Spec
 
 
@@ -42,3 +43,7 @@ class Random:
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """Uniform in [-1, 1], in evaluation too."""
         return jax.random.uniform(key, state.action_size.shape, minval=-1, maxval=1)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """There is nothing to export."""
+        raise DelayRLError("random draws its actions: it has no deterministic policy to export")

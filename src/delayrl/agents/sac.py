@@ -24,7 +24,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from delayrl import networks
-from delayrl.agents.base import Agent, Phase, descend
+from delayrl.agents.base import Agent, Deterministic, Phase, descend
 from delayrl.errors import DelayRLError
 from delayrl.networks import Gaussian, LogStdBounds, Params
 from delayrl.objectives import k_step_return, soft_target, soft_value, temperature_loss
@@ -116,6 +116,10 @@ class SAC:
         """A sample of the policy, or its mode."""
         policy = self.policy(state.actor, network_input(seen, self.actor_sees))
         return networks.sample(policy, key)[0] if explore else networks.mode(policy)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """The actor."""
+        return Deterministic(self.actor_sees, state.actor)
 
     def update(
         self,

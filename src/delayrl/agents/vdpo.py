@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from delayrl import networks
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Phase, descend
+from delayrl.agents.base import Agent, Deterministic, Phase, descend
 from delayrl.errors import DelayRLError
 from delayrl.networks import Gaussian, Params
 from delayrl.objectives import gaussian_kl, masked_mean
@@ -134,6 +134,10 @@ class VDPO:
         if self.behaviour == "mixture":
             return jnp.where(jax.random.bernoulli(coin_key), reference, delayed)
         return networks.lower_q(state.reference.critic, truth, reference, delayed)
+
+    def deterministic(self, state: State) -> Deterministic:
+        """Encoder and policy head; at age 0 the reference."""
+        return Deterministic("augmented", state.head, state.encoder or None, state.reference.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """(A) SAC's update of the reference; and of encoder and belief decoder (eq. 10), on the same batch."""

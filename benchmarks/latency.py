@@ -1,0 +1,130 @@
+"""How long one decision takes, for the docs: `python benchmarks/latency.py` measures, writes rows and the table.
+
+Bundles of the preset `paper` at HalfCheetah-v5's sizes (17 observations, 6 actions, 50 ms a step), with weights as they
+are at the start of a run: their values do not change the time. Several tries one after the other, each backend in a
+process of its own on one thread of one core; the spread over the tries is what the machine's other work makes of it.
+`--table` only writes the table again, from the rows.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from figures import HERE, insert
+
+from delayrl.agents import AGENTS
+from delayrl.deploy.bundle import BACKENDS
+from delayrl.deploy.export import bundle_files
+from delayrl.deploy.files import write_files
+from delayrl.deploy.latency import latency
+from delayrl.policy import Policy
+from delayrl.provenance import versions
+from delayrl.types import Spec
+
+ROWS = HERE / "results" / "latency.jsonl"
+SIZES, DT, DELAYS, NAMES = (17, 6), 0.05, (5, 25, 50), ("vdpo", "bpql")
+KEYS = ("p50", "p99", "max", "processor_p99")
+WORDS = {"numpy": "NumPy", "onnx": "ONNX Runtime", "jax": "JAX", "cpp": "C++ example"}
+
+
+def build(folder: Path, name: str, delay: int) -> Path:
+    """A bundle of fresh weights."""
+    agent, spec = AGENTS[name].presets["paper"].agent, Spec(*SIZES, delay)
+    policy = Policy(agent, agent.init(spec, jax.random.key(0)), spec, -np.ones(SIZES[1]), np.ones(SIZES[1]))
+    write_files(out := folder / f"{name}-{delay}", bundle_files(policy, {"agent": name, "dt": DT}))
+    return out
+
+
+def in_cpp(program: Path, bundle: Path, delay: int, decisions: int) -> dict[str, Any]:
+    """The C++ example's own clock, pinned to one core."""
+    pin = ["taskset", "-c", str(max(os.sched_getaffinity(0)))] if shutil.which("taskset") else []
+    command = [*pin, str(program), str(bundle), "--latency", str(decisions), str(delay)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(zip(KEYS, map(float, done.stdout.split()), strict=True))
+
+
+def measure(tries: int, decisions: int) -> None:
+    """All rows anew."""
+    package = versions()
+    try:
+        import onnxruntime
+
+        package["onnxruntime"] = onnxruntime.__version__
+    except ImportError:
+        pass
+    lines: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder) / "controller"
+        source = HERE.parent / "examples" / "cpp" / "controller.cpp"
+        compiler = shutil.which("g++")
+        if compiler:
+            flags = ["-std=c++17", "-O3", "-march=native"]
+            subprocess.run([compiler, *flags, "-o", str(program), str(source)], check=True)
+            package["compiler"] = subprocess.run(
+                [compiler, "-dumpfullversion"], capture_output=True, text=True
+            ).stdout.strip()
+        lines.append({"versions": package, "decisions": decisions, "dt": DT})
+        bundles = {(name, delay): build(Path(folder), name, delay) for name in NAMES for delay in DELAYS}
+        for number in range(tries):
+            for (name, delay), bundle in bundles.items():
+                common = {"try": number, "agent": name, "delay": delay, "load": round(os.getloadavg()[0], 2)}
+                for backend in BACKENDS:
+                    (row,) = latency(bundle, backend, decisions=decisions, ages=[delay])
+                    lines.append(common | {"backend": backend, **{k: round(row[k], 4) for k in KEYS}})
+                if compiler:
+                    lines.append(common | {"backend": "cpp", **in_cpp(program, bundle, delay, decisions)})
+            print(f"try {number + 1} of {tries} done")
+    ROWS.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def table() -> str:
+    """Markdown: medians over the tries, with the lowest and highest beside them."""
+    head, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    lines = ["| policy | Δ | backend | p50 ms | p99 ms | max ms | p99 of processor time, ms |", "|" + " --- |" * 7]
+    for name in NAMES:
+        for delay in DELAYS:
+            for backend in WORDS:
+                found = [r for r in rows if (r["agent"], r["delay"], r["backend"]) == (name, delay, backend)]
+                if not found:
+                    continue
+                cells = [f"`{name}`", delay, WORDS[backend]]
+                for key in KEYS:
+                    values = [row[key] for row in found]
+                    cells.append(f"{np.median(values):.2f} ({min(values):.2f}–{max(values):.2f})")
+                lines.append("| " + " | ".join(map(str, cells)) + " |")
+    package, tries = head["versions"], 1 + max(row["try"] for row in rows)
+    loads = [row["load"] for row in rows]
+    lines += [
+        "",
+        f"Preset `paper`, {SIZES[0]} observations, {SIZES[1]} actions, age Δ, fresh weights; the task's control "
+        f"period is {1000 * head['dt']:g} ms. Median of {tries} tries of {head['decisions']:,} decisions each "
+        f"(lowest–highest), back to back, on one thread of one core of a machine with {package['cores']} shared x86 "
+        f"cores and no GPU (load average {min(loads):.1f}–{max(loads):.1f} meanwhile). "
+        f"NumPy {package['numpy']}, onnxruntime "
+        f"{package.get('onnxruntime', '-')}, jax {package['jax']}, g++ {package.get('compiler', '-')} with "
+        f"`-O3 -march=native`. Rows: `benchmarks/results/latency.jsonl`.",
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tries", type=int, default=5)
+    parser.add_argument("--decisions", type=int, default=2000)
+    parser.add_argument("--table", action="store_true", help="only write the table again, from the rows")
+    given = parser.parse_args()
+    if not given.table:
+        measure(given.tries, given.decisions)
+    insert(HERE.parent / "docs" / "deploy.md", "latency", table())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""A bundle, ready to act: `load_bundle` reads and checks its files, `Bundle` is the policy."""
+
+import operator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
+from delayrl.deploy.network import Act, Network
+from delayrl.deploy.numpy_policy import numpy_policy
+from delayrl.errors import DelayRLError
+
+BACKENDS = ("numpy", "onnx", "jax")
+
+
+class Bundle:
+    """A policy, ready to act.
+
+    Attributes:
+        network: sizes, range of the actions, and architecture.
+        obs_size, action_size: S and A.
+        low, high: the range of the actions, [A], in the task's own units.
+        min_age, max_age: the ages that it was trained for; max_age is Δ.
+        dt: seconds between two decisions, where the task says so, else None.
+        metadata: all of bundle.json.
+        backend: what computes: "numpy", "onnx" or "jax".
+    """
+
+    def __init__(self, network: Network, metadata: dict[str, Any], act: Act, backend: str) -> None:
+        self.network, self.metadata, self.backend, self._act = network, metadata, backend, act
+        self.obs_size, self.action_size = network.obs_size, network.action_size
+        self.low, self.high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
+        self.min_age, self.max_age = 0, network.max_age
+        dt: Any = metadata.get("dt")
+        self.dt = float(dt) if type(dt) in (int, float) and 0 < dt < 1e9 else None
+
+    def __call__(self, obs: ArrayLike, actions: ArrayLike, age: int) -> NDArray[np.float32]:
+        """The deterministic action, in the task's own units. Nothing is remembered between calls.
+
+        Args:
+            obs: the newest observation that has arrived, [S].
+            actions: the actions applied since it was made, oldest first, [Δ, A], in the task's own units; what stands
+                after the first `age` is not read.
+            age: how many those are, 0..Δ.
+
+        Returns:
+            [A], float32.
+
+        Raises:
+            DelayRLError: wrong sizes, an age that was not trained, or numbers that are not finite.
+        """
+        try:
+            age = operator.index(age)
+        except TypeError:
+            raise DelayRLError(f"an age counts whole steps; got {age!r}") from None
+        obs, actions = np.asarray(obs, np.float32), np.asarray(actions, np.float32)
+        if obs.shape != (self.obs_size,):
+            raise DelayRLError(f"the policy takes observations of size {self.obs_size}; got shape {obs.shape}")
+        if actions.shape != (self.max_age, self.action_size):
+            expected = (self.max_age, self.action_size)
+            raise DelayRLError(f"the policy takes an action history of shape {expected}; got {actions.shape}")
+        if not 0 <= age <= self.max_age:
+            raise DelayRLError(f"the policy was trained for ages 0..{self.max_age}; got {age}")
+        if not (np.isfinite(obs).all() and np.isfinite(actions[:age]).all()):
+            raise DelayRLError("the policy was given an observation or an action that is not a finite number")
+        with np.errstate(all="ignore"):
+            action = self._act(obs, actions, age)
+        if not np.isfinite(action).all():
+            raise DelayRLError("the policy was given numbers so large that its action is not finite")
+        return action
+
+
+def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
+    """Read a bundle, and check everything in it.
+
+    Args:
+        path: its folder.
+        backend: "numpy"; "onnx", which runs policy.onnx with onnxruntime (extra `deploy`); or "jax".
+
+    Raises:
+        DelayRLError: no bundle, a broken or foreign one, or a backend that is not installed.
+    """
+    if backend not in BACKENDS:
+        raise DelayRLError(f"unknown backend {backend!r}; there are {', '.join(BACKENDS)}")
+    metadata, files = read_files(path, (WEIGHTS, GRAPH) if backend == "onnx" else (WEIGHTS,))
+    network, arrays = check_files(path, metadata, files)
+    reference = numpy_policy(network, arrays)
+    if backend == "numpy":
+        return Bundle(network, metadata, reference, backend)
+    if backend == "jax":
+        from delayrl.deploy.jax_policy import jax_policy
+
+        return Bundle(network, metadata, jax_policy(network, arrays), backend)
+    from delayrl.deploy.onnx_policy import onnx_policy
+
+    if GRAPH not in files:
+        raise DelayRLError(f"{path} holds no {GRAPH}")
+    try:
+        return Bundle(network, metadata, onnx_policy(network, files[GRAPH], reference), backend)
+    except DelayRLError as error:
+        raise DelayRLError(f"{Path(path) / GRAPH} is no policy of ours: {error}") from error

@@ -1,0 +1,134 @@
+"""From a run folder to a bundle. Here, and nowhere else in `delayrl.deploy` but in its backend `jax`, JAX is needed."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from gymnasium.spaces import Box
+
+from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, seal, write_files
+from delayrl.deploy.network import Arrays, Network
+from delayrl.deploy.onnx_graph import onnx_graph
+from delayrl.envs import make
+from delayrl.errors import DelayRLError
+from delayrl.policy import Policy, load
+from delayrl.provenance import versions
+from delayrl.runs import Run, flatten_tree
+
+
+def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict[str, Any]:
+    """Write the policy of a run folder, from its newest good checkpoint, as a bundle.
+
+    Args:
+        run: the run folder.
+        out: a new or empty folder.
+        force: replace a bundle that lies there.
+
+    Returns:
+        What stands in its bundle.json, but the sums.
+
+    Raises:
+        DelayRLError: no run, an agent without a deterministic policy, a folder that holds something else.
+    """
+    policy = load(run)
+    metadata = describe(Run(Path(run)), policy.spec.delay)
+    write_files(Path(out), bundle_files(policy, metadata), force=force)
+    return metadata
+
+
+def bundle_files(policy: Policy, metadata: dict[str, Any]) -> dict[str, bytes]:
+    """A bundle's files: the policy's network is described beside what `metadata` says."""
+    network, arrays = network_of(policy)
+    metadata = metadata | {"policy": network.document()}
+    weights = safetensors.numpy.save(dict(sorted(arrays.items())))
+    files = {WEIGHTS: weights, GRAPH: onnx_graph(network, arrays, metadata)}
+    check_files("the new bundle", metadata, files)
+    return seal(metadata, files)
+
+
+def network_of(policy: Policy) -> tuple[Network, Arrays]:
+    """The description and the arrays of the networks that give a policy's deterministic actions."""
+    spec, parts = policy.spec, policy.agent.deterministic(policy.state)
+    size = spec.action_size
+
+    def mean(mlp: Any) -> Any:
+        """Without the outputs for the log-std, which a deterministic action does not need."""
+        *hidden, last = mlp
+        return [*hidden, {"w": last["w"][:, :size], "b": last["b"][:size]}]
+
+    def hidden(mlp: Any) -> tuple[int, ...]:
+        return tuple(layer["b"].shape[0] for layer in mlp[:-1])
+
+    kind = "augmented" if parts.sees == "augmented" and spec.delay else "observation"
+    tree, sizes = {"head": mean(parts.head)}, {}
+    if parts.current is not None:
+        tree["current"] = mean(parts.current)
+    if parts.encoder is not None:
+        kind, tree["encoder"] = "transformer", parts.encoder
+        sizes = {"width": parts.encoder["position"].shape[1], "blocks": len(parts.encoder["blocks"])}
+    network = Network(
+        spec.obs_size,
+        size,
+        spec.delay,
+        tuple(policy.low.tolist()),
+        tuple(policy.high.tolist()),
+        kind,
+        hidden(parts.head),
+        None if parts.current is None else hidden(parts.current),
+        **sizes,
+    )
+    arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in flatten_tree(tree).items()}
+    network.check(arrays)
+    return network, arrays
+
+
+def describe(run: Run, longest: int) -> dict[str, Any]:
+    """All that a bundle says of its run: task, spaces, seconds a step, delay, training, and the last evaluation."""
+    config, step = run.config, run.latest().step
+    env = make(config["env"])
+    observations, actions = env.observation_space, env.action_space
+    assert isinstance(observations, Box)
+    assert isinstance(actions, Box)
+    dt = getattr(env.unwrapped, "dt", None)
+    env.close()
+    kept = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
+    return {
+        **{name: config.get(name) for name in kept},
+        "ages": [0, longest],
+        "dt": float(dt) if isinstance(dt, int | float | np.floating) else None,
+        "observation": _space(observations),
+        "action": _space(actions),
+        "normalisation": {
+            "observation": "none: the task's own numbers",
+            "action": "inside, low .. high is -1 .. 1; the bundle takes and gives the task's own units",
+        },
+        "step": step,
+        "evaluation": _evaluation(run, step),
+        "trained_with": config.get("versions"),
+        "exported_with": versions(),
+    }
+
+
+def _space(space: Box) -> dict[str, Any]:
+    """A Box as JSON can hold it; null where it has no bound."""
+    low, high = ([float(x) if np.isfinite(x) else None for x in bound] for bound in (space.low, space.high))
+    return {"shape": list(space.shape), "dtype": str(space.dtype), "low": low, "high": high}
+
+
+def _evaluation(run: Run, step: int) -> dict[str, Any] | None:
+    """Of the last evaluation up to the checkpoint; None where there was none yet."""
+    rows = [row for row in run.read("rows") if row["policy"] == "agent" and row["step"] <= step]
+    if not rows:
+        return None
+    last = max(row["step"] for row in rows)
+    returns = [float(row["return"]) for row in rows if row["step"] == last]
+    if not np.isfinite(returns).all():
+        raise DelayRLError(f"{run.path / 'rows.jsonl'} holds a return that is not finite")
+    return {
+        "step": last,
+        "episodes": len(returns),
+        "mean_return": float(np.mean(returns)),
+        "std_return": float(np.std(returns)),
+        "protocol": run.config.get("protocol"),
+    }

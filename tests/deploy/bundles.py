@@ -1,0 +1,66 @@
+"""Policies with random weights, and bundles and run folders of them, made without training."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from conftest import TINY, TINY_SAC
+from delayrl.agents import AGENTS as REGISTRY
+from delayrl.agents.base import Agent, template
+from delayrl.config import values_of
+from delayrl.deploy.export import bundle_files
+from delayrl.deploy.files import write_files
+from delayrl.policy import Policy
+from delayrl.runs import Run, flatten_tree
+from delayrl.types import Spec
+
+AGENTS = {"sac": TINY_SAC, **TINY}
+AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
+DELAY = 4
+OBS, LOW, HIGH = 10, np.array([-0.4, -2.0], np.float32), np.array([0.4, 3.0], np.float32)
+"""Reacher's sizes; a range of actions that is neither symmetric nor the same for all."""
+
+
+def random_state(agent: Agent, spec: Spec, seed: int = 0) -> Any:
+    """A state of the agent's form, with weights so large that actions fill their range."""
+    random = np.random.default_rng(seed)
+
+    def fill(leaf: Any) -> Any:
+        if not np.issubdtype(leaf.dtype, np.floating):
+            return np.zeros(leaf.shape, leaf.dtype)
+        inputs = leaf.shape[0] if len(leaf.shape) > 1 else 16
+        return (1.5 * random.normal(size=leaf.shape) * inputs**-0.5).astype(leaf.dtype)
+
+    return jax.tree.map(fill, template(agent, spec))
+
+
+def policy_of(name: str, seed: int = 0) -> Policy:
+    spec = Spec(OBS, len(LOW), 0 if name == "sac" else DELAY)
+    return Policy(AGENTS[name], random_state(AGENTS[name], spec, seed), spec, LOW, HIGH)
+
+
+def bundle_of(path: Path, policy: Policy, **metadata: Any) -> Path:
+    described = {"agent": "some", "env": "Reacher-v5", "delay": policy.spec.delay, "dt": 0.02, **metadata}
+    write_files(path, bundle_files(policy, described))
+    return path
+
+
+def run_of(path: Path, name: str = "vdpo", env: str = "Reacher-v5", delay: int = 3, sizes: tuple[int, int] = (OBS, 2)):
+    """A complete run folder with a checkpoint at step 240, as the loop would leave it."""
+    agent = AGENTS[name] if name in AGENTS else REGISTRY[name].presets["small"].agent
+    run = Run(path)
+    described = {"agent": name, "preset": "small", "env": env, "delay": delay, "protocol": "corrected"}
+    described |= {"privileged": agent.privileged, "hyperparameters": values_of(agent), "schedule": {}}
+    run.create(described | {"seed": 3, "versions": {"numpy": "2"}})
+    rows = [
+        {"step": step, "policy": policy, "episode": i, "return": float(step + i)}
+        for step in (120, 240)
+        for policy in ("agent", "reference")
+        for i in range(2)
+    ]
+    run.append("rows", rows)
+    run.save(240, flatten_tree(random_state(agent, Spec(*sizes, delay))), None, {}, complete=True)
+    return run

@@ -1,0 +1,177 @@
+"""The same action from JAX, NumPy, ONNX and C++: every agent, every age, random inputs."""
+
+import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bundles import AGENTS, bundle_of, policy_of, random_state
+
+from delayrl.agents import AGENTS as REGISTRY
+from delayrl.deploy import load_bundle
+from delayrl.deploy.export import network_of
+from delayrl.deploy.numpy_policy import _gelu
+from delayrl.errors import DelayRLError
+from delayrl.policy import Policy
+from delayrl.types import Spec
+
+SOURCE = Path(__file__).parents[2] / "examples" / "cpp" / "controller.cpp"
+REPEATS = 5
+
+
+@pytest.fixture(scope="module")
+def controller(tmp_path_factory: pytest.TempPathFactory) -> str:
+    compiler = shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("there is no C++ compiler")
+    program = tmp_path_factory.mktemp("cpp") / "controller"
+    flags = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+    subprocess.run([compiler, *flags, "-o", program, SOURCE], check=True)
+    return str(program)
+
+
+def ask(controller: str, bundle: Path, inputs: list) -> np.ndarray:
+    lines = [" ".join([str(age), *(f"{x:.9g}" for x in (*obs, *actions.ravel()))]) for obs, actions, age in inputs]
+    done = subprocess.run([controller, str(bundle)], input="\n".join(lines), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return np.array([line.split() for line in done.stdout.splitlines()], float)
+
+
+def random_inputs(policy: Policy, ages) -> list:
+    """Histories are full of actions whatever the age: those after the first `age` must not matter."""
+    random = np.random.default_rng(1)
+    shape = (policy.spec.delay, policy.spec.action_size)
+    return [
+        (
+            random.normal(size=policy.spec.obs_size).astype(np.float32),
+            random.uniform(policy.low, policy.high, shape).astype(np.float32),
+            age,
+        )
+        for age in ages
+        for _ in range(REPEATS)
+    ]
+
+
+def wanted(policy: Policy, inputs: list) -> np.ndarray:
+    return np.array([policy.act(obs, {"age": age, "actions": actions}) for obs, actions, age in inputs])
+
+
+def test_every_agent_is_exported() -> None:
+    assert set(AGENTS) >= set(REGISTRY) - {"random"}
+    random = REGISTRY["random"].presets["paper"].agent
+    spec = Spec(3, 1, 2)
+    with pytest.raises(DelayRLError, match="no deterministic policy"):
+        network_of(Policy(random, random_state(random, spec), spec, -np.ones(1), np.ones(1)))
+
+
+@pytest.mark.parametrize("name", list(AGENTS))
+def test_backends_agree(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    policy = policy_of(name)
+    path = bundle_of(tmp_path / "bundle", policy)
+    inputs = random_inputs(policy, range(policy.spec.delay + 1))
+    expected = wanted(policy, inputs)
+    width = policy.high - policy.low
+    assert ((expected - policy.low) / width).std(0).max() > 0.1  # agreement on a constant would show little
+    for backend in ("numpy", "onnx", "jax"):
+        bundle = load_bundle(path, backend)
+        found = np.array([bundle(*given) for given in inputs])
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5, err_msg=backend)
+    found = ask(request.getfixturevalue("controller"), path, inputs)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["vdpo", "bpql"])
+def test_preset_paper_agrees(name: str, tmp_path: Path, controller: str) -> None:
+    """Widths and depth as they are used, at HalfCheetah's sizes and Δ = 25."""
+    agent, spec = REGISTRY[name].presets["paper"].agent, Spec(17, 6, 25)
+    policy = Policy(agent, random_state(agent, spec), spec, -np.ones(6), np.ones(6))
+    path = bundle_of(tmp_path / "bundle", policy)
+    inputs = random_inputs(policy, (0, 1, 2, 13, 25))
+    expected = wanted(policy, inputs)
+    for backend in ("numpy", "onnx"):
+        bundle = load_bundle(path, backend)
+        np.testing.assert_allclose(np.array([bundle(*given) for given in inputs]), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(ask(controller, path, inputs), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "onnx", "jax"])
+def test_what_stands_after_the_age_is_not_read(backend: str, tmp_path: Path) -> None:
+    bundle = load_bundle(bundle_of(tmp_path / "bundle", policy_of("vdpo")), backend)
+    random = np.random.default_rng(0)
+    obs = random.normal(size=bundle.obs_size)
+    actions = random.uniform(bundle.low, bundle.high, (bundle.max_age, bundle.action_size))
+    for age in range(bundle.max_age + 1):
+        other = actions.copy()
+        other[age:] = np.nan
+        np.testing.assert_array_equal(bundle(obs, actions, age), bundle(obs, other, age))
+        if age:
+            other = actions.copy()
+            other[age - 1] += 0.1
+            assert np.abs(bundle(obs, actions, age) - bundle(obs, other, age)).max() > 1e-4
+
+
+def test_log_std_is_left_out() -> None:
+    """Half of the last layer's outputs; DIDA's student has none to leave out."""
+    for name in ("bpql", "dida"):
+        network, arrays = network_of(policy_of(name))
+        last = f"head.{len(network.hidden)}.b"
+        assert arrays[last].shape == (2,)
+
+
+def test_gelu() -> None:
+    x = np.linspace(-12, 12, 20001).astype(np.float32)
+    exact = [value * 0.5 * math.erfc(-value * 0.5**0.5) for value in x.tolist()]
+    np.testing.assert_allclose(_gelu(x), exact, rtol=1e-6, atol=3e-7)
+
+
+def test_needs_neither_jax_nor_gymnasium(tmp_path: Path) -> None:
+    """On the robot: NumPy and safetensors, and onnxruntime for its backend."""
+    path = bundle_of(tmp_path / "bundle", policy_of("vdpo"))
+    code = """
+import sys
+for name in ("jax", "gymnasium", "mujoco", "optax", "jaxtyping", "onnx", "matplotlib", "scipy"):
+    sys.modules[name] = None
+from delayrl.deploy import load_bundle
+import numpy as np
+for backend in ("numpy", "onnx"):
+    policy = load_bundle(sys.argv[1], backend)
+    print(policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size)), policy.max_age))
+try:
+    load_bundle(sys.argv[1], "jax")
+except ImportError:
+    print("no jax")
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, second, last = done.stdout.splitlines()
+    assert first == second or first[:6] == second[:6]
+    assert last == "no jax"
+
+
+def test_controller_in_cpp_refuses(controller: str, tmp_path: Path) -> None:
+    path = bundle_of(tmp_path / "bundle", policy_of("bpql"))
+    whole = (path / "policy.safetensors").read_bytes()
+    document = (path / "bundle.json").read_text()
+
+    def refused(*words: str) -> str:
+        done = subprocess.run([controller, *words], input="", capture_output=True, text=True)
+        assert done.returncode == 2
+        assert done.stderr.startswith("controller: ")
+        assert done.stderr.count("\n") == 1
+        return done.stderr
+
+    assert "usage" in refused()
+    assert "cannot read" in refused(str(tmp_path / "nowhere"))
+    for broken in (whole[:500], b"", b"\x80\x04." * 100, (1 << 62).to_bytes(8, "little") + whole[8:]):
+        (path / "policy.safetensors").write_bytes(broken)
+        refused(str(path))
+    (path / "policy.safetensors").write_bytes(whole)
+    for broken in ("", "{", "[" * 10_000, document.replace('"obs_size": 10', '"obs_size": 1e300')):
+        (path / "bundle.json").write_text(broken)
+        refused(str(path))
+    (path / "bundle.json").write_text(document.replace('"obs_size": 10', '"obs_size": 11'))
+    assert "head.0.w" in refused(str(path))

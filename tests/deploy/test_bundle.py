@@ -1,0 +1,373 @@
+"""A bundle may come from anybody: broken and malicious ones are one line, nothing runs, nothing is written."""
+
+import json
+import os
+import pickle
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from bundles import bundle_of, policy_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from delayrl.cli import main
+from delayrl.deploy import load_bundle
+from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, seal
+from delayrl.errors import DelayRLError
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bundle_of(tmp_path_factory.mktemp("original") / "bundle", policy_of("vdpo"))
+
+
+@pytest.fixture
+def bundle(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "bundle"))
+
+
+def refused(path: Path, words: str, backend: str = "numpy") -> None:
+    with pytest.raises(DelayRLError) as error:
+        load_bundle(path, backend)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 400
+
+
+def forge(bundle: Path, change: Callable[[dict[str, Any]], Any] | None = None, **files: bytes) -> None:
+    """What somebody else can write: a bundle that was changed, with sums that are right."""
+    document = json.loads((bundle / DOCUMENT).read_text())
+    if change is not None:
+        change(document)
+    content = {name: (bundle / name).read_bytes() for name in (WEIGHTS, GRAPH)}
+    content |= {{"weights": WEIGHTS, "graph": GRAPH}[name]: data for name, data in files.items()}
+    for name, data in seal({k: v for k, v in document.items() if k not in ("files", "checksum")}, content).items():
+        (bundle / name).write_bytes(data)
+
+
+def test_whole_bundles_load(bundle: Path) -> None:
+    policy = load_bundle(bundle)
+    assert (policy.obs_size, policy.action_size, policy.min_age, policy.max_age, policy.dt) == (10, 2, 0, 4, 0.02)
+    assert policy.metadata["env"] == "Reacher-v5"
+    forge(bundle)  # the forger's tools themselves break nothing
+    (bundle / "README.md").write_text("a model card may lie beside it")
+    assert load_bundle(bundle, "onnx").metadata["checksum"] == policy.metadata["checksum"]
+
+
+@pytest.mark.parametrize(
+    ("obs", "actions", "age", "words"),
+    [
+        (np.zeros(9), np.zeros((4, 2)), 0, "size 10; got shape (9,)"),
+        (np.zeros(10), np.zeros((3, 2)), 0, "history of shape (4, 2); got (3, 2)"),
+        (np.zeros(10), np.zeros((4, 2)), 5, "ages 0..4; got 5"),
+        (np.zeros(10), np.zeros((4, 2)), -1, "ages 0..4; got -1"),
+        (np.zeros(10), np.zeros((4, 2)), 1.5, "whole steps; got 1.5"),
+        (np.full(10, np.nan), np.zeros((4, 2)), 0, "not a finite number"),
+        (np.full(10, np.inf), np.zeros((4, 2)), 3, "not a finite number"),
+        (np.zeros(10), np.full((4, 2), np.nan), 1, "not a finite number"),
+        (np.full(10, 3e38), np.zeros((4, 2)), 2, "so large"),
+    ],
+)
+def test_calls_that_cannot_be_answered(original: Path, obs: Any, actions: Any, age: int, words: str) -> None:
+    for backend in ("numpy", "onnx"):
+        with pytest.raises(DelayRLError, match=words.replace("(", r"\(").replace(")", r"\)")):
+            load_bundle(original, backend)(obs, actions, age)
+
+
+def test_no_bundle(tmp_path: Path, original: Path) -> None:
+    refused(tmp_path / "nowhere", "no folder")
+    refused(tmp_path, "it has no bundle.json")
+    refused(original / WEIGHTS, "no folder")
+    with pytest.raises(DelayRLError, match="unknown backend 'torch'; there are numpy, onnx, jax"):
+        load_bundle(original, "torch")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "no JSON"),
+        (b"{", "no JSON"),
+        (b"[" * 100_000, "no JSON"),
+        (b'{"a":' * 100_000, "no JSON"),
+        (b"\x80\x04\x95", "no JSON"),
+        (b'{"format": NaN}', "no JSON"),
+        (b'{"format": 1, "format": 1}', "no JSON"),
+        (b'{"format": ' + b"9" * 5000 + b"}", "no JSON"),
+        (b"[]", "no format"),
+        (b"{}", "no format"),
+        (b'{"format": 2}', "format 2; this version reads 1"),
+        (b'{"format": true}', "format True; this version reads 1"),
+        (b'{"format": "1"}', "format 1; this version reads 1"),
+        (b'{"format": 1}', "checksum"),
+        (b'{"format": 1, "checksum": "\\ud800"}', "checksum"),
+        (b" " * (1 << 20) + b"{}", "larger than"),
+    ],
+    ids=range(16),
+)
+def test_broken_documents(bundle: Path, content: bytes, words: str) -> None:
+    (bundle / DOCUMENT).write_bytes(content)
+    refused(bundle, words)
+
+
+def test_changed_documents(bundle: Path) -> None:
+    document = json.loads((bundle / DOCUMENT).read_text())
+    document["policy"]["high"][0] = 100.0
+    (bundle / DOCUMENT).write_text(json.dumps(document))
+    refused(bundle, "checksum")
+
+
+BAD_POLICIES: list[tuple[str, Any]] = [
+    *(("obs_size", value) for value in (0, -1, 1.0, "10", True, None, 10**30, 11)),
+    *(("action_size", value) for value in (0, 3, [2])),
+    *(("max_age", value) for value in (-1, 0, 5, 10**6)),
+    *(("low", value) for value in ([0.0], [0.0, "a"], [10**400, 0], [0.0, 3.0], [1e38, 0], {}, [True, 0])),
+    *(("high", value) for value in ([0.4], [-0.4, 3.0], None)),
+    *(("input", value) for value in ("observation", "augmented", "pickle", None, ["transformer"])),
+    *(("hidden", value) for value in ([], [16], [0, 16], [16] * 1000, None, [10**6, 10**6])),
+    *(("current", value) for value in (None, [], 3)),
+    *(("width", value) for value in (0, 9, 10**6)),
+    *(("blocks", value) for value in (0, 1, 3, 1000, 10**6)),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), BAD_POLICIES, ids=range(len(BAD_POLICIES)))
+def test_policies_that_are_not_the_weights(bundle: Path, name: str, value: Any) -> None:
+    """A well-made bundle whose description does not fit: told apart before anything large is allocated."""
+    forge(bundle, lambda document: document["policy"].update({name: value}))
+    refused(bundle, "")
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/etc/passwd", "policy.pkl", "bundle.json", "..", "", "policy.onnx/../x"]
+)
+def test_other_names(bundle: Path, name: str) -> None:
+    document = json.loads((bundle / DOCUMENT).read_text())
+    document["files"][name] = document["files"][WEIGHTS]
+    (bundle / DOCUMENT).write_text(json.dumps(document | {"checksum": checksum(document)}))
+    refused(bundle, "names a file that no bundle has")
+
+
+def test_names_of_another_kind(bundle: Path) -> None:
+    for files in (None, [], {}, {WEIGHTS: None}, {WEIGHTS: []}, {WEIGHTS: {"bytes": 1}}, "policy.safetensors"):
+        document = json.loads((bundle / DOCUMENT).read_text()) | {"files": files}
+        document["checksum"] = checksum(document)
+        (bundle / DOCUMENT).write_text(json.dumps(document))
+        refused(bundle, "")
+
+
+class Bomb:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return (os.mkdir, (str(self.path),))
+
+
+@pytest.mark.parametrize("which", ["weights", "graph"])
+def test_pickles_are_not_opened(bundle: Path, tmp_path: Path, which: str) -> None:
+    bomb = pickle.dumps(Bomb(tmp_path / "executed"))
+    forge(bundle, **{which: bomb})
+    refused(bundle, "", "onnx")
+    (bundle / "policy.pkl").write_bytes(bomb)
+    refused(bundle, "", "onnx")
+    assert not (tmp_path / "executed").exists()
+    pickle.loads(bomb)
+    assert (tmp_path / "executed").exists()  # the bomb was alive
+
+
+def header(data: bytes) -> tuple[dict[str, Any], bytes]:
+    length = struct.unpack("<Q", data[:8])[0]
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
+
+
+def with_header(entries: dict[str, Any], rest: bytes) -> bytes:
+    text = json.dumps(entries).encode()
+    return struct.pack("<Q", len(text)) + text + rest
+
+
+def test_broken_weights(bundle: Path) -> None:
+    whole = (bundle / WEIGHTS).read_bytes()
+    entries, rest = header(whole)
+    name = "head.0.w"
+
+    def changed(**values: Any) -> bytes:
+        return with_header(entries | {name: entries[name] | values}, rest)
+
+    huge = [2**31, 2**31]
+    for data, words in [
+        (b"", "no safetensors"),
+        (whole[:7], "no safetensors"),
+        (whole[:100], "no safetensors"),
+        (whole[:-1], "no safetensors"),
+        (whole + b"\0", "no safetensors"),
+        (struct.pack("<Q", 2**63) + whole[8:], "header is too long"),
+        (struct.pack("<Q", (1 << 20) + 1) + b" " * (1 << 21), "header is too long"),
+        (with_header({}, b""), "lack array"),
+        (changed(shape=huge), "no safetensors"),
+        (changed(shape=huge, data_offsets=[0, 2**64 - 1]), "no safetensors"),
+        (changed(shape=[-1, 2]), "no safetensors"),
+        (changed(data_offsets=[0, 4]), "no safetensors"),
+        (changed(dtype="I32"), "expected float32"),
+        (changed(dtype="PICKLE"), "no safetensors"),
+        (changed(shape=[1, *entries[name]["shape"]]), "expected float32"),
+    ]:
+        forge(bundle, weights=data)
+        refused(bundle, words)
+
+
+def test_weights_of_other_kinds(bundle: Path) -> None:
+    arrays = safetensors.numpy.load((bundle / WEIGHTS).read_bytes())
+    head = arrays["head.0.w"]
+
+    def forged(words: str, **changes: Any) -> None:
+        mine = {
+            k: v for k, v in (arrays | {k.replace("_", "."): v for k, v in changes.items()}).items() if v is not None
+        }
+        forge(bundle, weights=safetensors.numpy.save(mine))
+        refused(bundle, words)
+
+    for value in (np.nan, np.inf, -np.inf):
+        bad = head.copy()
+        bad[-1, -1] = value
+        forged("head.0.w holds numbers that are not finite", head_0_w=bad)
+    forged("float64", head_0_w=head.astype(np.float64))
+    forged("float16", head_0_w=head.astype(np.float16))
+    forged("expected float32", head_0_w=head[:-1])
+    forged("lack array 'head.0.w'", head_0_w=None)
+    forged("unknown array 'head.9.w'", head_9_w=head)
+    forged("unknown array", **{"x" * 5000: head})
+
+
+def test_sums_of_other_files(bundle: Path, tmp_path: Path) -> None:
+    """Weights of another bundle, cut ones, missing ones: without a forged sum they do not come as far as the parser."""
+    other = bundle_of(tmp_path / "other", policy_of("vdpo", seed=1))
+    shutil.copy(other / WEIGHTS, bundle / WEIGHTS)
+    refused(bundle, "cut or changed")
+    (bundle / WEIGHTS).write_bytes((other / WEIGHTS).read_bytes()[:-10])
+    refused(bundle, "cut or changed")
+    (bundle / WEIGHTS).unlink()
+    refused(bundle, "missing")
+
+
+@pytest.mark.parametrize("name", [DOCUMENT, WEIGHTS, GRAPH])
+def test_links_and_pipes(bundle: Path, tmp_path: Path, name: str) -> None:
+    outside = tmp_path / "outside"
+    shutil.move(bundle / name, outside)
+    (bundle / name).symlink_to(outside)
+    refused(bundle, "is a link", "onnx")
+    (bundle / name).unlink()
+    os.mkfifo(bundle / name)
+    refused(bundle, "not a regular file", "onnx")
+    (bundle / name).unlink()
+    (bundle / name).mkdir()
+    refused(bundle, "", "onnx")
+
+
+def test_foreign_graphs(bundle: Path, tmp_path: Path) -> None:
+    """Whatever it computes: if it is not the policy in the weights, it does not act."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    whole = (bundle / GRAPH).read_bytes()
+    other = bundle_of(tmp_path / "other", policy_of("vdpo", seed=1))
+    renamed = onnx.load_from_string(whole)
+    renamed.graph.input[2].name = "delay"
+    for node in renamed.graph.node:
+        for i, name in enumerate(node.input):
+            if name == "age":
+                node.input[i] = "delay"
+    (tmp_path / "secret.bin").write_bytes(b"\0" * 1_000_000)
+    external = onnx.load_from_string(whole)
+    tensor = next(t for t in external.graph.initializer if len(t.dims) == 2 and t.data_type == TensorProto.FLOAT)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value=str(tmp_path / "secret.bin"))
+    custom = onnx.load_from_string(whole)
+    custom.graph.node[0].domain = "evil.domain"
+    custom.opset_import.append(helper.make_opsetid("evil.domain", 1))
+    nothing = helper.make_graph(
+        [helper.make_node("Identity", ["c"], ["action"])],
+        "g",
+        [*list(renamed.graph.input)[:2], helper.make_tensor_value_info("age", TensorProto.INT64, [])],
+        list(renamed.graph.output),
+        [numpy_helper.from_array(np.zeros(2, np.float32), "c")],
+    )
+    constant = helper.make_model(nothing, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    for data, words in [
+        (b"", "cannot load"),
+        (b"garbage", "cannot load"),
+        (whole[: len(whole) // 2], "cannot load"),
+        ((other / GRAPH).read_bytes(), "other actions than the weights"),
+        (constant.SerializeToString(), "other actions than the weights"),
+        (renamed.SerializeToString(), "inputs and outputs"),
+        (external.SerializeToString(), "refers to another file"),
+        (custom.SerializeToString(), "cannot load"),
+    ]:
+        forge(bundle, graph=data)
+        refused(bundle, words, "onnx")
+        load_bundle(bundle)  # its weights are those that were exported
+
+
+def test_a_word_in_the_metadata_is_not_a_reference(tmp_path: Path) -> None:
+    path = bundle_of(tmp_path / "bundle", policy_of("bpql"), env="some/relocation-v0")
+    assert load_bundle(path, "onnx").metadata["env"] == "some/relocation-v0"
+
+
+def test_without_a_graph(bundle: Path) -> None:
+    document = json.loads((bundle / DOCUMENT).read_text())
+    rest = {k: v for k, v in document.items() if k not in ("files", "checksum")}
+    (bundle / DOCUMENT).write_bytes(seal(rest, {WEIGHTS: (bundle / WEIGHTS).read_bytes()})[DOCUMENT])
+    load_bundle(bundle)
+    refused(bundle, "holds no policy.onnx", "onnx")
+
+
+@settings(max_examples=150, deadline=None, database=None)
+@given(data=st.data())
+def test_any_change_is_noticed(original: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    """A byte changed, a stretch cut out or put in, in any file: one line, or (spaces in the JSON) the same policy."""
+    home = tmp_path_factory.mktemp("changed")
+    name = data.draw(st.sampled_from([DOCUMENT, WEIGHTS]))
+    content = bytearray((original / name).read_bytes())
+    at = data.draw(st.integers(0, len(content) - 1))
+    length = data.draw(st.integers(0, 20))
+    content[at : at + length] = data.draw(st.binary(max_size=20))
+    shutil.copytree(original, home, dirs_exist_ok=True)
+    (home / name).write_bytes(content)
+    try:
+        policy = load_bundle(home)
+    except DelayRLError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+    else:
+        assert policy.metadata == load_bundle(original).metadata
+    finally:
+        shutil.rmtree(home)
+
+
+@settings(max_examples=150, deadline=None, database=None)
+@given(content=st.binary(max_size=200), length=st.integers(0, 2**64 - 1) | st.integers(0, 300))
+def test_any_weights_are_refused(original: Path, tmp_path_factory: Any, content: bytes, length: int) -> None:
+    """A fuzzer behind right sums: the parser itself meets garbage."""
+    home = tmp_path_factory.mktemp("fuzzed")
+    shutil.copytree(original, home, dirs_exist_ok=True)
+    forge(home, weights=struct.pack("<Q", length) + content)
+    refused(home, "cannot be used")
+    shutil.rmtree(home)
+
+
+def test_the_command_line_says_it_in_one_line(bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    forge(bundle, weights=pickle.dumps(Bomb(tmp_path / "executed")))
+    for command in (["latency", str(bundle)], ["push", str(bundle), "some/where"]):
+        with pytest.raises(SystemExit) as end:
+            main(command)
+        out, err = capsys.readouterr()
+        assert (end.value.code, out, err.count("\n")) == (2, "", 1)
+        assert "no safetensors file" in err
+    assert not (tmp_path / "executed").exists()

@@ -1,0 +1,179 @@
+"""`delayrl export` and `delayrl latency`: what stands in a bundle, and where it may be written."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bundles import bundle_of, policy_of, run_of
+
+from delayrl import load, make
+from delayrl.cli import main
+from delayrl.deploy import export_run, load_bundle
+from delayrl.deploy.latency import ages_of, latency
+from delayrl.errors import DelayRLError
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_of(tmp_path_factory.mktemp("runs") / "run").path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(list(arguments))
+    out, err = capsys.readouterr()
+    assert (end.value.code, out, err.count("\n")) == (2, "", 1)
+    return err
+
+
+def test_a_run_becomes_a_bundle(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "bundle"
+    main(["export", str(run), "--out", str(out)])
+    assert "vdpo on Reacher-v5, ages 0..3" in capsys.readouterr().out
+    assert sorted(file.name for file in out.iterdir()) == ["bundle.json", "policy.onnx", "policy.safetensors"]
+    assert not [file for file in tmp_path.iterdir() if file != out]
+    metadata = load_bundle(out).metadata
+    assert (metadata["agent"], metadata["env"], metadata["delay"], metadata["ages"]) == (
+        "vdpo",
+        "Reacher-v5",
+        3,
+        [0, 3],
+    )
+    assert metadata["dt"] == pytest.approx(0.02)
+    assert metadata["action"] == {"shape": [2], "dtype": "float32", "low": [-1.0, -1.0], "high": [1.0, 1.0]}
+    assert metadata["observation"]["low"] == [None] * 10
+    assert metadata["step"] == 240
+    evaluation = {"step": 240, "episodes": 2, "mean_return": 240.5, "std_return": 0.5, "protocol": "corrected"}
+    assert metadata["evaluation"] == evaluation
+    assert metadata["hyperparameters"]["width"] == 8
+    assert metadata["trained_with"] == {"numpy": "2"}
+    assert metadata["exported_with"]["jax"]
+    assert metadata["privileged"] is True
+
+
+def test_the_bundle_plays_as_the_run(run: Path, tmp_path: Path) -> None:
+    """A whole episode in the task, from age 0 on, with what the wrapper shows."""
+    export_run(run, tmp_path / "bundle")
+    policy, bundles = load(run), [load_bundle(tmp_path / "bundle", backend) for backend in ("numpy", "onnx")]
+    env = make("Reacher-v5", 3)
+    obs, info = env.reset(seed=0)
+    ages, done = [], False
+    while not done:
+        expected = policy.act(obs, info)
+        for bundle in bundles:
+            found = bundle(obs, info["actions"], info["age"])
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+        ages.append(info["age"])
+        obs, _, terminated, truncated, info = env.step(found)
+        done = terminated or truncated
+    assert ages == [0, 1, 2, *[3] * 47]
+
+
+def test_the_graph_says_what_it_is(run: Path, tmp_path: Path) -> None:
+    import onnxruntime
+
+    export_run(run, tmp_path / "bundle")
+    session = onnxruntime.InferenceSession(tmp_path / "bundle" / "policy.onnx")
+    told = json.loads(session.get_modelmeta().custom_metadata_map["delayrl"])
+    metadata = load_bundle(tmp_path / "bundle").metadata
+    assert told == {k: v for k, v in metadata.items() if k not in ("files", "checksum", "format")}
+
+
+def test_the_same_run_gives_the_same_bundle(run: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        export_run(run, tmp_path / name)
+    assert load_bundle(tmp_path / "one").metadata["checksum"] == load_bundle(tmp_path / "two").metadata["checksum"]
+
+
+def test_before_the_first_evaluation(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "bpql")
+    (run.path / "rows.jsonl").write_text("")
+    assert export_run(run.path, tmp_path / "bundle")["evaluation"] is None
+
+
+def test_a_task_that_does_not_say_its_step(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "a-sac", "delayrl/Counter-v0", 2, (2, 1))
+    assert export_run(run.path, tmp_path / "bundle")["dt"] is None
+    assert load_bundle(tmp_path / "bundle").dt is None
+
+
+def test_random_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_of(tmp_path / "run", "random")
+    assert "no deterministic policy" in refused(capsys, "export", str(tmp_path / "run"), "--out", str(tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_else_is_overwritten(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "policy.onnx").write_text("mine")
+    file = tmp_path / "file"
+    file.write_text("mine")
+    arguments = ["export", str(run), "--out"]
+    assert "is not empty" in refused(capsys, *arguments, str(full))
+    assert "holds no bundle" in refused(capsys, *arguments, str(full), "--force")
+    assert "no folder" in refused(capsys, *arguments, str(file), "--force")
+    assert "not a run folder" in refused(capsys, "export", str(full), "--out", str(tmp_path / "new"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "full"]
+    assert (full / "policy.onnx").read_text() == file.read_text() == "mine"
+
+
+def test_out_may_be_here(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    export_run(run, ".")
+    load_bundle(".")
+    assert [file.name for file in tmp_path.iterdir()] == ["here"]
+
+
+def test_force_replaces_a_bundle_and_follows_no_link(run: Path, tmp_path: Path) -> None:
+    out, outside = bundle_of(tmp_path / "bundle", policy_of("bpql")), tmp_path / "outside"
+    outside.write_text("mine")
+    (out / "policy.onnx").unlink()
+    (out / "policy.onnx").symlink_to(outside)
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(DelayRLError, match="not empty"):
+        export_run(run, out)
+    export_run(run, out, force=True)
+    assert load_bundle(out, "onnx").metadata["agent"] == "vdpo"
+    assert (out / "notes.txt").read_text() == outside.read_text() == "mine"
+    assert not (out / "policy.onnx").is_symlink()
+
+
+def test_latency(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (ages_of(3), ages_of(5), ages_of(30)) == ([3], [5], [5, 25, 30])
+    out = tmp_path / "bundle"
+    export_run(run, out)
+    main(["latency", str(out), "--decisions", "40", "--period", "10"])
+    text = capsys.readouterr().out
+    lines = [line.split() for line in text.splitlines()]
+    assert [line[0] for line in lines[1:4]] == ["numpy", "onnx", "jax"]
+    for line in lines[1:4]:
+        assert line[1] == "3"
+        p50, p99, most, processor = map(float, line[2:6])
+        assert 0 < p50 <= p99 <= most < 10_000
+        assert 0 < processor < 10_000
+        assert float(line[6].rstrip("%")) == pytest.approx(10 * p99, abs=0.06)
+    assert "control period 10 ms" in text
+    main(["latency", str(out), "--decisions", "5", "--backend", "numpy", "--ages", "0", "2"])
+    text = capsys.readouterr().out
+    assert "control period 20 ms" in text
+    assert "onnx" not in text
+
+
+def test_latency_refuses(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "bundle"
+    export_run(run, out)
+    for words, told in (
+        (["--period", "0"], "milliseconds above 0"),
+        (["--period", "nan"], "milliseconds above 0"),
+        (["--decisions", "0"], "decisions must lie"),
+        (["--ages", "9", "--backend", "numpy"], "ages 0..3; got 9"),
+        (["--backend", "torch"], "invalid choice"),
+    ):
+        assert told in refused(capsys, "latency", str(out), *words)
+    (out / "policy.onnx").unlink()
+    with pytest.raises(DelayRLError, match=r"policy.onnx is missing"):
+        latency(out, "onnx", decisions=1)
