@@ -135,6 +135,21 @@ def provenance(name: str) -> str:
     )
 
 
+def overhead() -> str:
+    """Markdown: what the wrappers cost."""
+    first, *lines = [json.loads(line) for line in (HERE / "results" / "overhead.jsonl").read_text().splitlines()]
+    rows = ["| wrapper, delay | environments | ratio of times | quartiles |", "| --- | --- | --- | --- |"]
+    for line in lines:
+        low, high = line["quartiles"]
+        rows.append(f"| `{line['wrapper']}` | {line['environments']} | {line['ratio']:.2f} | {low:.2f} to {high:.2f} |")
+    versions = first["versions"]
+    return "\n".join(rows) + (
+        f"\n\nProcessor time, {first['rounds']} rounds; {versions['cores']} shared x86 cores, Python {versions['python']}, "
+        f"NumPy {versions['numpy']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, commit "
+        f"{versions['commit']}. Rows: `benchmarks/results/overhead.jsonl`."
+    )
+
+
 def insert(page: Path, key: str, text: str) -> None:
     """Put generated text between `<!-- key -->` and `<!-- /key -->`."""
     content = page.read_text()
@@ -164,11 +179,13 @@ def main() -> None:
         "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "walk": ["docs/benchmarks.md"],
         "walk-random": ["docs/benchmarks.md"],
-        "pusher-random": ["docs/benchmarks.md"],
+        "pusher-random": ["docs/delays.md"],
     }.items():
         if (HERE / "results" / f"{name}.jsonl").exists():
             for page in pages:
                 insert(root / page, name, table(name) + "\n\n" + provenance(name))
+    if (HERE / "results" / "overhead.jsonl").exists():
+        insert(root / "docs" / "delays.md", "overhead", overhead())
 
 
 if __name__ == "__main__":

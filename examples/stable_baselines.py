@@ -1,6 +1,6 @@
 """Stable-Baselines3's SAC on a delayed task: the wrappers, and nothing else of ours.
 
-    pip install delayrl 'stable-baselines3>=2.4'
+    pip install -e '.[examples]'
     python examples/stable_baselines.py --steps 6000
 
 `AugmentedObservation` makes one vector of what the delay leaves to know, so that an algorithm that has never heard of
