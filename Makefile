@@ -9,7 +9,7 @@ check:     ## format, lint, types
 	mypy
 
 test:      ## everything that takes seconds
-	pytest
+	pytest -n 2 --dist loadfile
 
 test-all:  ## with the tests that train for minutes
 	pytest -m ''

@@ -144,8 +144,8 @@ def overhead() -> str:
         rows.append(f"| `{line['wrapper']}` | {line['environments']} | {line['ratio']:.2f} | {low:.2f} to {high:.2f} |")
     versions = first["versions"]
     return "\n".join(rows) + (
-        f"\n\nProcessor time, {first['rounds']} rounds; {versions['cores']} shared x86 cores, Python {versions['python']}, "
-        f"NumPy {versions['numpy']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, commit "
+        f"\n\nProcessor time, {first['rounds']} rounds; {versions['cores']} shared x86 cores, "
+        f"Python {versions['python']}, NumPy {versions['numpy']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, commit "
         f"{versions['commit']}. Rows: `benchmarks/results/overhead.jsonl`."
     )
 
