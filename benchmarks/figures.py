@@ -143,10 +143,12 @@ def overhead() -> str:
         low, high = line["quartiles"]
         rows.append(f"| `{line['wrapper']}` | {line['environments']} | {line['ratio']:.2f} | {low:.2f} to {high:.2f} |")
     versions = first["versions"]
+    libraries = f"NumPy {versions['numpy']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}"
+    where = (
+        f"{versions['cores']} shared x86 cores, Python {versions['python']}, {libraries}, commit {versions['commit']}"
+    )
     return "\n".join(rows) + (
-        f"\n\nProcessor time, {first['rounds']} rounds; {versions['cores']} shared x86 cores, "
-        f"Python {versions['python']}, NumPy {versions['numpy']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, commit "
-        f"{versions['commit']}. Rows: `benchmarks/results/overhead.jsonl`."
+        f"\n\nProcessor time, {first['rounds']} rounds; {where}. Rows: `benchmarks/results/overhead.jsonl`."
     )
 
 
