@@ -8,7 +8,9 @@ import delayrl
 SOURCE = Path(delayrl.__file__).parent
 ORDER = [
     "errors",
-    "delays wrappers envs",
+    "delays wrappers envs deploy.statistics deploy.history",
+    "deploy.controller",
+    "deploy",
     "types config",
     "views networks replay provenance",
     "objectives transformer",
