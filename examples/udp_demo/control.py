@@ -1,4 +1,4 @@
-"""The controller: a policy in a process of its own, which sees the plant only through UDP. Prints statistics as JSON."""
+"""The controller: a policy in a process of its own, which sees the plant only through UDP. Prints its statistics."""
 
 import argparse
 import dataclasses

@@ -3,8 +3,8 @@
 Lockstep (the default): at each step it sends the observations that arrive now and a tick that names them, repeats both
 until the action for this step is back, and steps. Nothing depends on how busy the machine is.
 
-Real time: a step every dt seconds by the clock. The observation is made, and sets out, at the beginning of a step; half a
-step later the newest action that has arrived is applied, whatever it was chosen for.
+Real time: a step every dt seconds by the clock. The observation is made, and sets out, at the beginning of a step; half
+a step later the newest action that has arrived is applied, whatever it was chosen for.
 """
 
 import argparse
@@ -55,9 +55,10 @@ class Line:
             except TimeoutError:
                 return None
             packet = decode(data)
-            if sender == self.peer and packet is not None and packet.kind == ACTION:
-                if packet.episode == episode and packet.step in steps:
-                    return packet.step, packet.values
+            if sender != self.peer or packet is None or packet.kind != ACTION:
+                continue
+            if packet.episode == episode and packet.step in steps:
+                return packet.step, packet.values
 
     def _receive(self, timeout: float) -> tuple[bytes, Any]:
         self.socket.settimeout(max(timeout, 1e-4))

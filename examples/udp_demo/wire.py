@@ -13,7 +13,7 @@ LONGEST = 1024  # numbers in a packet
 
 
 class Packet(NamedTuple):
-    """One datagram. `values`: an observation, an action, or of a tick the steps of the observations that come with it."""
+    """One datagram. `values`: an observation, an action, or of a tick the steps of the observations with it."""
 
     kind: int
     episode: int
