@@ -33,6 +33,7 @@ class Last:
         self.low, self.high, self.max_age = policy.low, policy.high, 64
 
     def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        """Of the actions since, the newest."""
         longest = self._policy.max_age
         if age <= longest:
             return self._policy(obs, actions[:longest], age)

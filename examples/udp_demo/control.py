@@ -14,7 +14,7 @@ import numpy as np
 from policies import load
 from wire import ACTION, END, HELLO, OBSERVATION, PAUSE, TICK, decode, encode
 
-from delayrl.deploy import Controller
+from delayrl.deploy import ClockError, Controller
 from delayrl.errors import DelayRLError
 
 PATIENCE = 120.0  # seconds of silence after which the simulator is gone
@@ -101,7 +101,10 @@ def real_time(controller: Controller, line: socket.socket) -> None:
         with turn:
             if begun is None or over or controller.episode != episode:
                 continue
-            action = controller.act(at)
+            try:
+                action = controller.act(at)
+            except ClockError:  # woken so late that newer observations are here: the next tick's turn
+                continue
         line.send(encode(ACTION, episode, step, at, action))
     if broken:
         raise broken[0]
