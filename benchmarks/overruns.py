@@ -42,7 +42,7 @@ class Last:
 
 def returns(env: gym.Env[Any, Any], policy: Policy, link: Link, on_overrun: str) -> list[float]:
     """Of `EPISODES` episodes, each with its own start state and network."""
-    controller = Controller(policy, on_overrun=on_overrun)  # type: ignore[arg-type]
+    controller = Controller(policy, on_overrun=on_overrun)
     totals = []
     for episode in range(EPISODES):
         obs, _ = env.reset(seed=1_000_000 + episode)

@@ -25,7 +25,7 @@ def make_node(policy: Policy, **settings: Any) -> Any:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
-    class DelayedPolicy(Node):  # type: ignore[misc]
+    class DelayedPolicy(Node):
         """Observes whenever a message arrives, acts on a timer."""
 
         def __init__(self) -> None:
@@ -75,7 +75,7 @@ def main() -> None:
     import rclpy
     from rclpy.node import Node
 
-    from delayrl.deploy import load_bundle  # type: ignore[attr-defined]
+    from delayrl.deploy import load_bundle
 
     rclpy.init()
     parameters = Node("delayed_policy_parameters")

@@ -116,7 +116,7 @@ def finite(value: Any) -> Any:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policy", required=True, help="a run folder, a bundle, or: predictor")
     parser.add_argument("--blind", action="store_true", help="take every observation for current")
     parser.add_argument("--port", type=int, required=True)
@@ -126,7 +126,7 @@ def main() -> None:
     try:
         stamps = "seconds" if given.real_time else "steps"
         policy = load(given.policy, given.blind)
-        controller = Controller(policy, stamps=stamps, on_overrun=given.on_overrun)  # type: ignore[arg-type]
+        controller = Controller(policy, stamps=stamps, on_overrun=given.on_overrun)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             line.settimeout(PATIENCE)
             line.connect(("127.0.0.1", given.port))  # packets of others are not delivered

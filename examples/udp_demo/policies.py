@@ -46,8 +46,8 @@ class Predictor:
         task = gym.make(env, disable_env_checker=True)
         plant: Any = task.unwrapped
         task.reset(seed=0)
-        self.obs_size, self.action_size = task.observation_space.shape[0], task.action_space.shape[0]  # type: ignore[index]
-        self.low, self.high, self.dt, self.max_age = task.action_space.low, task.action_space.high, plant.dt, max_age  # type: ignore[attr-defined]
+        self.obs_size, self.action_size = task.observation_space.shape[0], task.action_space.shape[0]
+        self.low, self.high, self.dt, self.max_age = task.action_space.low, task.action_space.high, plant.dt, max_age
 
         def step(state: np.ndarray, action: np.ndarray) -> np.ndarray:
             plant.set_state(state[: plant.model.nq], state[plant.model.nq :])
@@ -101,7 +101,7 @@ def load(source: str, blind: bool = False) -> Policy:
         policy = RunPolicy(Path(source))
     else:
         try:
-            from delayrl.deploy import load_bundle  # type: ignore[attr-defined]
+            from delayrl.deploy import load_bundle
         except ImportError:
             raise DelayRLError(f"{source} is no run folder: train one with `delayrl train vdpo …`") from None
         policy = load_bundle(source)

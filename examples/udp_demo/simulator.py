@@ -94,10 +94,10 @@ def lockstep(env: gym.Env, line: Line, travelling: Travelling, episode: int, see
 
 def real_time(env: gym.Env, line: Line, travelling: Travelling, episode: int, seed: int) -> dict[str, Any]:
     """One episode by the clock."""
-    dt = env.unwrapped.dt  # type: ignore[attr-defined]
+    dt = env.unwrapped.dt
     obs, _ = env.reset(seed=seed)
     made, total, trace, held = {}, 0.0, [], 0
-    action, newest = np.zeros(env.action_space.shape, env.action_space.dtype), -1  # type: ignore[arg-type]
+    action, newest = np.zeros(env.action_space.shape, env.action_space.dtype), -1
     start = time.monotonic()
     for step in range(10**9):
         made[step] = obs
@@ -127,7 +127,7 @@ def real_time(env: gym.Env, line: Line, travelling: Travelling, episode: int, se
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="InvertedPendulum-v5")
     parser.add_argument("--low", type=int, default=0, help="shortest travel of an observation, steps")
     parser.add_argument("--high", type=int, default=0, help="longest")

@@ -181,7 +181,7 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
         policy,
         stamps="seconds" if setting.seconds else "steps",
         action_delay=setting.action_delay,
-        on_overrun=setting.on_overrun,  # type: ignore[arg-type]
+        on_overrun=setting.on_overrun,
         idle=None if setting.idle is None else [setting.idle],
         clock=lambda: world,
     )

@@ -102,9 +102,9 @@ class Uniform:
 @pytest.mark.parametrize("delay", [0, 1, 5, Uniform(4)])
 def test_shows_what_the_wrapper_shows(stamps: str, delay: object) -> None:
     """The wrapper's shown observation goes through the network: here, one that brings all of them at random."""
-    env = DelayedObservation(gym.make("Pendulum-v1"), delay)  # type: ignore[arg-type]
+    env = DelayedObservation(gym.make("Pendulum-v1"), delay)
     policy = Recorder(env, env.law.maximum, dt=0.05)
-    controller = Controller(policy, stamps=stamps, on_overrun="raise")  # type: ignore[arg-type]
+    controller = Controller(policy, stamps=stamps, on_overrun="raise")
     rng = np.random.default_rng(0)
     clock = 100.0
     for episode in range(3):
@@ -208,7 +208,7 @@ def test_halfway_between_two_steps_is_the_later() -> None:
 @pytest.mark.parametrize("on_overrun", ["hold", "clip", "raise"])
 def test_overruns(on_overrun: str) -> None:
     policy = counting(2)
-    controller = Controller(policy, on_overrun=on_overrun)  # type: ignore[arg-type]
+    controller = Controller(policy, on_overrun=on_overrun)
     controller.observe([0.0], 0)
     assert [controller.act()[0] for _ in range(3)] == [2, 3, 4]
     if on_overrun == "raise":
@@ -259,7 +259,7 @@ def test_actions_in_flight_add_to_the_age() -> None:
 
 def test_actions_lie_in_the_policys_range() -> None:
     policy = counting()
-    policy.high = np.float32([2.5])  # type: ignore[misc]
+    policy.high = np.float32([2.5])
     controller = Controller(policy)
     controller.observe([0.0], 0)
     assert [controller.act()[0] for _ in range(2)] == [2, 2.5]
@@ -339,7 +339,7 @@ def test_a_policy_may_scribble_on_what_it_is_shown() -> None:
 @pytest.mark.parametrize("on_overrun", ["hold", "clip"])
 def test_an_observation_older_than_the_memory(on_overrun: str) -> None:
     """Long forgotten: still an overrun, `clip` has nothing to show and holds, and the age is no nonsense."""
-    controller = Controller(counting(2), stamps="seconds", dt=0.25, on_overrun=on_overrun)  # type: ignore[arg-type]
+    controller = Controller(counting(2), stamps="seconds", dt=0.25, on_overrun=on_overrun)
     controller.observe([1.0], 90.0, 90.0)  # 40 periods before the first command
     for i in range(300):
         action = controller.act(100 + 0.25 * i)
@@ -351,7 +351,7 @@ def test_an_observation_older_than_the_memory(on_overrun: str) -> None:
     controller.act(1e9)  # a stall of many steps costs no memory
     controller.observe([2.0], 1e9, 1e9)
     controller.act(1e9 + 0.25)
-    assert controller.policy.calls[-1][0::2] == (2.0, 1)  # type: ignore[attr-defined]
+    assert controller.policy.calls[-1][0::2] == (2.0, 1)
     with pytest.raises(DelayRLError, match="steps, from 0 on"):
         controller.applied([0.0], controller.step + 1)
     assert not controller.applied([0.0], 0)
@@ -361,8 +361,8 @@ def test_a_policy_without_a_number_is_not_recorded() -> None:
     policy = counting()
     controller = Controller(policy)
     controller.observe([0.0], 0)
-    controller.policy = lambda obs, actions, age: np.float32([np.nan])  # type: ignore[assignment, return-value]
-    controller.policy.action_size, controller.policy.max_age = 1, 3  # type: ignore[misc]
+    controller.policy = lambda obs, actions, age: np.float32([np.nan])
+    controller.policy.action_size, controller.policy.max_age = 1, 3
     with pytest.raises(DelayRLError, match="the policy's action must be"):
         controller.act()
     assert controller.step == -1
