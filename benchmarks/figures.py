@@ -125,7 +125,11 @@ def udp_table(lines: list[dict[str, Any]]) -> str:
         played = [line for line in lines if "return" in line and (line["scenario"], line["controller"]) == key]
         returns, found = [episode["return"] for episode in played], row["statistics"]
         age = "–" if found["age_mean"] is None else f"{found['age_mean']:.2f} ± {found['age_std']:.2f}"
-        words = {"delayed": "with its history", "blind": "blind to the delay"}[row["controller"]]
+        words = {
+            "delayed": "with its history",
+            "deaf": "the same, not told which commands were lost",
+            "blind": "blind to the delay",
+        }[row["controller"]]
         overruns = f"{found['overruns']:,} of {found['decisions']:,}"
         held = f", {sum(episode['held'] for episode in played):,} late actions" if row["real_time"] else ""
         cells = [row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from policies import load
-from wire import ACTION, END, HELLO, OBSERVATION, PAUSE, TICK, decode, encode
+from wire import ACTION, APPLIED, END, HELLO, OBSERVATION, PAUSE, TICK, Packet, decode, encode
 
 from delayrl.deploy import ClockError, Controller
 from delayrl.errors import DelayRLError
@@ -20,7 +20,30 @@ from delayrl.errors import DelayRLError
 PATIENCE = 120.0  # seconds of silence after which the simulator is gone
 
 
-def lockstep(controller: Controller, line: socket.socket) -> None:
+class Told:
+    """What the actuator says that it did, until the controller has come to that step."""
+
+    def __init__(self, controller: Controller, listens: bool) -> None:
+        self._controller, self._listens = controller, listens
+        self._actions: dict[int, np.ndarray] = {}
+
+    def take(self, packet: Packet) -> None:
+        """What was done in a step; it may be told before the controller has acted for it, if that is late."""
+        if self._listens:
+            self._actions[packet.step] = packet.values
+            self.settle()
+
+    def settle(self) -> None:
+        """Correct the history as far as it goes."""
+        for step in [step for step in self._actions if step <= self._controller.step]:
+            self._controller.applied(self._actions.pop(step), step)
+
+    def forget(self) -> None:
+        """An episode is over."""
+        self._actions.clear()
+
+
+def lockstep(controller: Controller, line: socket.socket, told: Told) -> None:
     """Answer every tick once; a tick that comes again gets the same answer."""
     arrived: dict[int, np.ndarray] = {}
     answer = b""
@@ -34,10 +57,13 @@ def lockstep(controller: Controller, line: socket.socket) -> None:
         if packet.episode == controller.episode + 1:
             controller.reset()
             arrived.clear()
+            told.forget()
         if packet.episode != controller.episode:
             continue
         if packet.kind == OBSERVATION:
             arrived[packet.step] = packet.values
+        elif packet.kind == APPLIED:
+            told.take(packet)
         elif packet.kind == TICK and packet.step == controller.step + 1:
             due = [int(k) for k in packet.values]
             if all(k in arrived for k in due):  # else it comes again
@@ -50,7 +76,7 @@ def lockstep(controller: Controller, line: socket.socket) -> None:
             line.send(answer)
 
 
-def real_time(controller: Controller, line: socket.socket) -> None:
+def real_time(controller: Controller, line: socket.socket, told: Told) -> None:
     """One thread listens, this one acts: a quarter of a step after each step's beginning, for its beginning."""
     dt = controller.policy.dt
     assert dt is not None
@@ -73,9 +99,12 @@ def real_time(controller: Controller, line: socket.socket) -> None:
                         begun = None
                     elif packet.kind == OBSERVATION and packet.step == 0 and packet.episode == controller.episode + 1:
                         controller.reset(packet.stamp)
+                        told.forget()
                         begun = packet.stamp
                     if packet.kind == OBSERVATION:
                         controller.observe(packet.values, packet.stamp, episode=packet.episode)
+                    elif packet.kind == APPLIED and packet.episode == controller.episode:
+                        told.take(packet)
                     turn.notify()
         except BaseException as error:
             broken.append(error)
@@ -105,6 +134,7 @@ def real_time(controller: Controller, line: socket.socket) -> None:
                 action = controller.act(at)
             except ClockError:  # woken so late that newer observations are here: the next tick's turn
                 continue
+            told.settle()
         line.send(encode(ACTION, episode, step, at, action))
     if broken:
         raise broken[0]
@@ -119,6 +149,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policy", required=True, help="a run folder, a bundle, or: predictor")
     parser.add_argument("--blind", action="store_true", help="take every observation for current")
+    parser.add_argument("--deaf", action="store_true", help="do not listen to what the actuator did")
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--on-overrun", choices=["hold", "clip", "raise"], default="clip")
     parser.add_argument("--real-time", action="store_true")
@@ -130,7 +161,7 @@ def main() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             line.settimeout(PATIENCE)
             line.connect(("127.0.0.1", given.port))  # packets of others are not delivered
-            (real_time if given.real_time else lockstep)(controller, line)
+            (real_time if given.real_time else lockstep)(controller, line, Told(controller, not given.deaf))
     except (DelayRLError, OSError) as error:
         sys.exit(f"controller: {error}")
     statistics = dataclasses.asdict(controller.statistics)

@@ -9,7 +9,7 @@ import argparse
 import json
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,24 +22,33 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Scenario:
-    """A network, a policy behind it, and whether time is the clock's."""
+    """A network, the controller behind it, and whether time is the clock's.
+
+    The controllers: `delayed` keeps the history; `deaf` does too, but is not told what the actuator did; `blind` takes
+    every observation for current.
+    """
 
     name: str
     link: Link
-    blind: bool
+    controller: str
     real_time: bool = False
 
 
 ROUGH = Link(2, 5, loss=0.1, double=0.05)
+BOTH = ("blind", "delayed")
 SCENARIOS = [
-    Scenario("no delay", Link(), blind=True),
-    *(Scenario("5 steps late", Link(5, 5), blind) for blind in (True, False)),
-    *(Scenario("3 to 5 steps late", Link(3, 5), blind) for blind in (True, False)),
-    *(Scenario("2 to 5 steps late, 10 % lost, 5 % twice", ROUGH, blind) for blind in (True, False)),
+    Scenario("no delay", Link(), "blind"),
+    *(Scenario("5 steps late", Link(5, 5), controller) for controller in BOTH),
+    *(Scenario("3 to 5 steps late", Link(3, 5), controller) for controller in BOTH),
+    *(Scenario("2 to 5 steps late, 10 % lost, 5 % twice", ROUGH, controller) for controller in BOTH),
+    *(
+        Scenario("so, and 20 % of the commands lost", replace(ROUGH, missed=0.2), controller)
+        for controller in ("blind", "deaf", "delayed")
+    ),
 ]
 REAL_TIME = [
-    Scenario("real time, 2 to 5 steps late, 10 % lost, 5 % twice", ROUGH, blind, real_time=True)
-    for blind in (True, False)
+    Scenario("real time, 2 to 5 steps late, 10 % lost, 5 % twice", ROUGH, controller, real_time=True)
+    for controller in BOTH
 ]
 
 
@@ -58,8 +67,8 @@ def play(scenario: Scenario, policy: str, episodes: int, seed: int, steps: int |
         first = plant.stdout.readline()
         if not first:
             raise SystemExit(plant.communicate()[1].strip())
-        blind = ["--blind"] if scenario.blind else []
-        control = _start("control.py", f"--policy={policy}", f"--port={json.loads(first)['port']}", *blind, *options)
+        kind = {"blind": ["--blind"], "deaf": ["--deaf"], "delayed": []}[scenario.controller]
+        control = _start("control.py", f"--policy={policy}", f"--port={json.loads(first)['port']}", *kind, *options)
         try:
             said, complaint = control.communicate()
             if control.returncode:
@@ -107,7 +116,7 @@ def main() -> None:
     print(f"{'observations':<52}{'policy':<9}{'mean':>7}{'worst':>7}   age")
     for scenario in SCENARIOS + (REAL_TIME if given.real_time else []):
         episodes, statistics = play(scenario, given.policy, given.episodes, given.seed)
-        about = {"scenario": scenario.name, "controller": "blind" if scenario.blind else "delayed"}
+        about = {"scenario": scenario.name, "controller": scenario.controller}
         lines += [about | episode for episode in episodes]
         lines.append(about | {"link": asdict(scenario.link), "real_time": scenario.real_time, "statistics": statistics})
         returns = [episode["return"] for episode in episodes]

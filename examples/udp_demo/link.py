@@ -11,13 +11,15 @@ class Link:
     """What happens to observations on their way.
 
     `low` and `high` bound the travel time in steps: whole steps in lockstep, any time between in real time; each
-    observation draws its own, so they overtake each other. `loss` and `double` are probabilities.
+    observation draws its own, so they overtake each other. `loss` and `double` are probabilities; so is `missed`, that
+    a command gets lost on its way back (in lockstep; the plant then goes on with the one before).
     """
 
     low: float = 0
     high: float = 0
     loss: float = 0.0
     double: float = 0.0
+    missed: float = 0.0
 
 
 class Travelling:
@@ -31,6 +33,7 @@ class Travelling:
 
     def __init__(self, link: Link, seed: list[int], whole: bool = True) -> None:
         self._link, self._random, self._whole = link, np.random.default_rng(seed), whole
+        self._commands = np.random.default_rng([*seed, 1])
         self._queue: list[tuple[float, int]] = []  # (arrival, step)
 
     def send(self, step: int) -> None:
@@ -46,6 +49,10 @@ class Travelling:
             lost, travels[0] = False, 0
         for travel in travels[: 0 if lost else 1 + int(doubled)]:
             heapq.heappush(self._queue, (step + float(travel), step))
+
+    def missed(self) -> bool:
+        """Whether the command that is on its way is lost."""
+        return bool(self._commands.random() < self._link.missed)
 
     def due(self, now: float) -> list[int]:
         """Steps of the observations that arrive by `now`, in the order of their arrival."""

@@ -5,6 +5,8 @@ until the action for this step is back, and steps. Nothing depends on how busy t
 
 Real time: a step every dt seconds by the clock. The observation is made, and sets out, at the beginning of a step; half
 a step later the newest action that has arrived is applied, whatever it was chosen for.
+
+The actuator tells at once what it did in a step. It is beside the controller; the sensor is what is far away.
 """
 
 import argparse
@@ -18,7 +20,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from link import Link, Travelling
-from wire import ACTION, END, HELLO, OBSERVATION, PAUSE, TICK, decode, encode
+from wire import ACTION, APPLIED, END, HELLO, OBSERVATION, PAUSE, TICK, decode, encode
 
 TRACED = 151  # steps of the first episode whose first two numbers are told
 PATIENCE = 120.0  # seconds until a silent controller is given up; it may have to load and compile first
@@ -72,12 +74,14 @@ def lockstep(env: gym.Env, line: Line, travelling: Travelling, episode: int, see
     """One episode; time stands still until the controller has answered."""
     obs, _ = env.reset(seed=seed)
     made, total, trace = {}, 0.0, []
+    action, told = np.zeros(env.action_space.shape, env.action_space.dtype), []
     for step in range(10**9):
         made[step] = obs
         trace.append(obs[:2])
         travelling.send(step)
         due = travelling.due(step)
         packets = [encode(OBSERVATION, episode, k, k, made[k]) for k in due]
+        packets += told
         packets.append(encode(TICK, episode, step, step, np.float64(due)))
         deadline, answer = time.monotonic() + PATIENCE, None
         while answer is None:
@@ -85,7 +89,9 @@ def lockstep(env: gym.Env, line: Line, travelling: Travelling, episode: int, see
                 raise TimeoutError
             line.send(*packets)
             answer = line.action(episode, 0.5, range(step, step + 1))
-        obs, reward, terminated, truncated, _ = env.step(answer[1].astype(env.action_space.dtype))
+        action = action if travelling.missed() else answer[1].astype(action.dtype)
+        told = [encode(APPLIED, episode, step, step, action)]
+        obs, reward, terminated, truncated, _ = env.step(action)
         total += float(reward)
         if terminated or truncated:
             return {"return": total, "length": step + 1, "held": 0, "trace": [*trace, obs[:2]]}
@@ -113,6 +119,7 @@ def real_time(env: gym.Env, line: Line, travelling: Travelling, episode: int, se
             if answer is not None:
                 newest, action = answer[0], answer[1].astype(action.dtype)
         held += newest < step
+        line.send(encode(APPLIED, episode, step, start + step * dt, action))
         obs, reward, terminated, truncated, _ = env.step(action)
         total += float(reward)
         if terminated or truncated:
@@ -133,13 +140,14 @@ def main() -> None:
     parser.add_argument("--high", type=int, default=0, help="longest")
     parser.add_argument("--loss", type=float, default=0.0, help="probability that an observation is lost")
     parser.add_argument("--double", type=float, default=0.0, help="probability that it arrives twice")
+    parser.add_argument("--missed", type=float, default=0.0, help="probability that a command is lost")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, help="end episodes early")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--real-time", action="store_true")
     given = parser.parse_args()
 
-    link = Link(given.low, given.high, given.loss, given.double)
+    link = Link(given.low, given.high, given.loss, given.double, given.missed)
     play: Play = real_time if given.real_time else lockstep
     env = gym.make(given.env, disable_env_checker=True, max_episode_steps=given.steps)
     line = Line()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-HELLO, OBSERVATION, TICK, ACTION, PAUSE, END = range(1, 7)
+HELLO, OBSERVATION, TICK, ACTION, APPLIED, PAUSE, END = range(1, 8)
 HEAD = struct.Struct("<4sBIIdH")  # magic, kind, episode, step, stamp, how many numbers follow
 MAGIC = b"dly1"
 LONGEST = 1024  # numbers in a packet

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +20,26 @@ from demo import ROUGH, Scenario, play  # noqa: E402
 from link import Link, Travelling  # noqa: E402
 
 
-def run(blind: bool, link: Link, steps: int, real_time: bool = False) -> tuple[list[dict], dict]:
-    return play(Scenario("test", link, blind, real_time), "predictor", episodes=2, seed=3, steps=steps)
+def run(controller: str, link: Link, steps: int, real_time: bool = False) -> tuple[list[dict], dict]:
+    return play(Scenario("test", link, controller, real_time), "predictor", episodes=2, seed=3, steps=steps)
 
 
 def test_the_history_holds_the_pole_and_without_it_falls() -> None:
     """The predictor stands only if age and actions are right: see the controls below."""
-    episodes, statistics = run(False, ROUGH, 150)
+    episodes, statistics = run("delayed", replace(ROUGH, missed=0.2), 150)
     assert [episode["return"] for episode in episodes] == [150, 150]
     assert statistics["decisions"] == 300
     assert statistics["duplicate"] + statistics["late"] > 10
     assert 2 < statistics["age_mean"] < 5
-    again, same = run(False, ROUGH, 150)
+    again, same = run("delayed", replace(ROUGH, missed=0.2), 150)
     assert (again, same) == (episodes, statistics)  # whatever else the machine does
-    blind, _ = run(True, ROUGH, 150)
+    blind, _ = run("blind", ROUGH, 150)
     assert max(episode["return"] for episode in blind) < 60
 
 
 def test_by_the_clock() -> None:
     """How well it stands depends on the machine; that it goes through and ends does not."""
-    episodes, statistics = run(False, Link(1, 3), 40, real_time=True)
+    episodes, statistics = run("delayed", Link(1, 3), 40, real_time=True)
     assert len(episodes) == 2
     assert all(0 < episode["length"] <= 40 for episode in episodes)
     assert statistics["decisions"] > 0
@@ -118,7 +119,7 @@ def test_rows_and_picture(tmp_path: Path) -> None:
     rows = [
         {"scenario": name, "controller": who, "return": 10.0, "trace": [[0.0, 0.1], [0.0, 0.2]]}
         for name in ("no delay", "late")
-        for who in ("delayed", "blind")
+        for who in ("delayed", "blind", "deaf")
     ]
     draw(json.loads(json.dumps(rows)), tmp_path / "udp.png")
     assert (tmp_path / "udp.png").stat().st_size > 1000
