@@ -131,7 +131,7 @@ def udp_table(lines: list[dict[str, Any]]) -> str:
             "blind": "blind to the delay",
         }[row["controller"]]
         overruns = f"{found['overruns']:,} of {found['decisions']:,}"
-        held = f", {sum(episode['held'] for episode in played):,} late actions" if row["real_time"] else ""
+        held = f"; {sum(episode['held'] for episode in played):,} actions too late" if row["real_time"] else ""
         cells = [row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held]
         table.append("| " + " | ".join(cells) + " |")
     policy, versions = head["policy"], head["versions"]
