@@ -92,10 +92,9 @@ def describe(policy: str) -> Row:
     """What was run, and on what: for the rows."""
     from delayrl.provenance import versions
 
-    about: Row = {"agent": "predictor"}
-    config = Path(policy) / "config.json"
-    if config.exists():
-        run = json.loads(config.read_text())
+    about: Row = {"agent": policy if policy == "predictor" else "bundle"}
+    if (Path(policy) / "checkpoints").is_dir():
+        run = json.loads((Path(policy) / "config.json").read_text())
         about = {name: run[name] for name in ("agent", "env", "delay", "preset", "seed", "schedule", "versions")}
     return {"policy": about, "versions": versions()}
 
