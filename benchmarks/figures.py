@@ -1,6 +1,7 @@
 """Pictures and tables of the docs, from committed rows alone: `python benchmarks/figures.py`."""
 
 import json
+import runpy
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,56 @@ def overhead() -> str:
     )
 
 
+def udp_table(lines: list[dict[str, Any]]) -> str:
+    """Markdown: each network and controller of the UDP demonstration, over its episodes."""
+    head, rows = lines[0], [line for line in lines if "statistics" in line]
+    table = [
+        "| observations | policy | mean return | worst | age (steps) | overruns |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        key = (row["scenario"], row["controller"])
+        played = [line for line in lines if "return" in line and (line["scenario"], line["controller"]) == key]
+        returns, found = [episode["return"] for episode in played], row["statistics"]
+        age = "–" if found["age_mean"] is None else f"{found['age_mean']:.2f} ± {found['age_std']:.2f}"
+        words = {
+            "delayed": "with its history",
+            "deaf": "the same, not told which commands were lost",
+            "blind": "blind to the delay",
+        }[row["controller"]]
+        overruns = f"{found['overruns']:,} of {found['decisions']:,}"
+        held = f"; {sum(episode['held'] for episode in played):,} actions too late" if row["real_time"] else ""
+        cells = [row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held]
+        table.append("| " + " | ".join(cells) + " |")
+    policy, versions = head["policy"], head["versions"]
+    about = (
+        f"{head['episodes']} episodes each, the best possible is 1000; `{policy['agent']}` trained with delay "
+        f"{policy['delay']}, preset `{policy['preset']}`, seed {policy['seed']}; `on_overrun` is `clip`; "
+        f"{versions['cores']} shared x86 cores, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, "
+        f"commit {versions['commit']}. Rows: `benchmarks/results/udp.jsonl`."
+    )
+    return "\n".join(table) + "\n\n" + about
+
+
+def overruns_table(lines: list[dict[str, Any]]) -> str:
+    """Markdown: mean returns under networks that are slower than was trained, by the answer to it."""
+    policy, versions, rows = lines[0]["policy"], lines[0]["versions"], lines[1:]
+    table = ["| travel time, steps | `clip` | `hold` | the last Δ actions |", "| --- | --- | --- | --- |"]
+    for i in range(0, len(rows), 3):
+        link = rows[i]["link"]
+        assert [row["answer"] for row in rows[i : i + 3]] == ["clip", "hold", "last"]
+        words = f"{link['low']} to {link['high']}" if link["low"] < link["high"] else f"{link['low']}"
+        lost = f", {100 * link['loss']:.0f} % lost" if link["loss"] else ""
+        means = [f"{np.mean(row['returns']):.0f}" for row in rows[i : i + 3]]
+        table.append("| " + " | ".join([words + lost, *means]) + " |")
+    about = (
+        f"{policy['env']}, {len(rows[0]['returns'])} episodes each, the best possible is 1000; `{policy['agent']}` "
+        f"trained with delay {policy['delay']}, preset `{policy['preset']}`, seed {policy['seed']}; "
+        f"MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: `benchmarks/results/overruns.jsonl`."
+    )
+    return "\n".join(table) + "\n\n" + about
+
+
 def insert(page: Path, key: str, text: str) -> None:
     """Put generated text between `<!-- key -->` and `<!-- /key -->`."""
     content = page.read_text()
@@ -188,6 +239,14 @@ def main() -> None:
                 insert(root / page, name, table(name) + "\n\n" + provenance(name))
     if (HERE / "results" / "overhead.jsonl").exists():
         insert(root / "docs" / "delays.md", "overhead", overhead())
+    udp, overruns = (
+        [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
+        for name in ("udp", "overruns")
+    )
+    insert(root / "docs" / "runtime.md", "overruns", overruns_table(overruns))
+    insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
+    draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
+    draw_udp(udp, images / "udp.png")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""From a run to a robot: bundles of a policy, and what runs them. Nothing here imports JAX until a run is exported.
+"""From a run to a robot: bundles of a policy, what runs them, and what keeps the history right around them.
 
-`load_bundle` reads a bundle that `delayrl export` wrote; it needs NumPy and safetensors alone.
+Nothing here imports JAX until a run is exported. `load_bundle` needs NumPy and safetensors, `Controller` NumPy alone.
 """
 
 from importlib import import_module
@@ -9,9 +9,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from delayrl.deploy.bundle import Bundle as Bundle
     from delayrl.deploy.bundle import load_bundle as load_bundle
+    from delayrl.deploy.controller import ClockError as ClockError
+    from delayrl.deploy.controller import Controller as Controller
+    from delayrl.deploy.controller import OverrunError as OverrunError
+    from delayrl.deploy.controller import Policy as Policy
     from delayrl.deploy.export import export_run as export_run
+    from delayrl.deploy.statistics import Statistics as Statistics
 
-_HOME = {"Bundle": "bundle", "export_run": "export", "load_bundle": "bundle"}
+_HOME = {
+    "Bundle": "bundle",
+    "ClockError": "controller",
+    "Controller": "controller",
+    "OverrunError": "controller",
+    "Policy": "controller",
+    "Statistics": "statistics",
+    "export_run": "export",
+    "load_bundle": "bundle",
+}
 __all__ = sorted(_HOME)
 
 

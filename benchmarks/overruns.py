@@ -1,0 +1,81 @@
+"""Three answers to an age that was not trained, played with a run: `python benchmarks/overruns.py RUN OUT.jsonl`.
+
+`hold` and `clip` are the controller's; `last` is what a buffer of fixed length does: it forgets the oldest actions.
+"""
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "udp_demo"))
+
+from link import Link, Travelling
+from policies import RunPolicy
+
+from delayrl.deploy import Controller, Policy
+from delayrl.provenance import versions
+
+LINKS = [Link(4, 6), Link(4, 7), Link(3, 8), Link(4, 8), Link(3, 5, loss=0.4), Link(6, 6)]
+EPISODES = 10
+
+
+class Last:
+    """Shows a policy the newest Δ actions, however old the observation is."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self.obs_size, self.action_size, self.dt = policy.obs_size, policy.action_size, policy.dt
+        self.low, self.high, self.max_age = policy.low, policy.high, 64
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        """Of the actions since, the newest."""
+        longest = self._policy.max_age
+        if age <= longest:
+            return self._policy(obs, actions[:longest], age)
+        return self._policy(obs, actions[age - longest : age], longest)
+
+
+def returns(env: gym.Env[Any, Any], policy: Policy, link: Link, on_overrun: str) -> list[float]:
+    """Of `EPISODES` episodes, each with its own start state and network."""
+    controller = Controller(policy, on_overrun=on_overrun)
+    totals = []
+    for episode in range(EPISODES):
+        obs, _ = env.reset(seed=1_000_000 + episode)
+        controller.reset()
+        travelling, made, total, done = Travelling(link, [0, episode]), [], 0.0, False
+        while not done:
+            made.append(obs)
+            travelling.send(len(made) - 1)
+            for k in travelling.due(len(made) - 1):
+                controller.observe(made[k], k)
+            obs, reward, terminated, truncated, _ = env.step(controller.act())
+            total, done = total + float(reward), terminated or truncated
+        totals.append(total)
+    return totals
+
+
+def main() -> None:
+    run, out = Path(sys.argv[1]), Path(sys.argv[2])
+    config = json.loads((run / "config.json").read_text())
+    policy = RunPolicy(run)
+    env = gym.make(config["env"])
+    kept = ("agent", "env", "delay", "preset", "seed", "schedule")
+    lines: list[dict[str, Any]] = [{"policy": {name: config[name] for name in kept}, "versions": versions()}]
+    for link in LINKS:
+        for name, player, on_overrun in (
+            ("clip", policy, "clip"),
+            ("hold", policy, "hold"),
+            ("last", Last(policy), "raise"),
+        ):
+            lines.append({"link": asdict(link), "answer": name, "returns": returns(env, player, link, on_overrun)})
+            print(link, name, np.mean(lines[-1]["returns"]), flush=True)
+    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""A ROS 2 node that runs a delayed policy: JointState in, Float64MultiArray out.
+
+python examples/ros2_node.py --ros-args -p policy:=BUNDLE -p on_overrun:=hold -p action_delay:=0
+
+The observation is [position…, velocity…] of the JointState, in the order of the policy's task; its age comes from
+`header.stamp`, which must be the time of the measurement, on the clock of this node (`use_sim_time` works). rclpy is
+imported when the node is made: it comes with ROS and not from PyPI.
+"""
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from delayrl.deploy import Controller, OverrunError, Policy
+from delayrl.errors import DelayRLError
+
+REPORT_EVERY = 10.0  # seconds
+
+
+def make_node(policy: Policy, **settings: Any) -> Any:
+    """The node; `settings` go to the controller: on_overrun, action_delay, dt, idle."""
+    from rclpy.node import Node
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Float64MultiArray
+
+    class DelayedPolicy(Node):
+        """Observes whenever a message arrives, acts on a timer."""
+
+        def __init__(self) -> None:
+            super().__init__("delayed_policy")
+            self.controller = Controller(policy, stamps="seconds", clock=self.seconds, **settings)
+            self.output = self.create_publisher(Float64MultiArray, "commands", 1)
+            # the newest few are enough, and a lost one is no harm: best effort, not reliable
+            self.create_subscription(JointState, "joint_states", self.observe, qos_profile_sensor_data)
+            self.create_timer(settings.get("dt") or policy.dt, self.act)
+            self.create_timer(REPORT_EVERY, self.report)
+
+        def seconds(self) -> float:
+            return self.get_clock().now().nanoseconds * 1e-9
+
+        def observe(self, message: Any) -> None:
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            try:
+                self.controller.observe(np.concatenate([message.position, message.velocity]), stamp)
+            except DelayRLError as error:  # another robot's message
+                self.get_logger().warning(str(error))
+
+        def act(self) -> None:
+            if not self.controller.ready:
+                return
+            try:
+                action = self.controller.act()
+            except OverrunError as error:  # no command: the drive's own watchdog stops it
+                self.get_logger().error(str(error))
+                return
+            except DelayRLError as error:
+                self.get_logger().warning(str(error))
+                return
+            self.output.publish(Float64MultiArray(data=action.astype(float).tolist()))
+
+        def report(self) -> None:
+            s = self.controller.statistics
+            self.get_logger().info(
+                f"effective delay {s.age_mean:.2f} ± {s.age_std:.2f} steps ({s.delay_mean * 1e3:.1f} ± "
+                f"{s.delay_std * 1e3:.1f} ms), period {s.period_mean * 1e3:.1f} ± {s.period_std * 1e3:.1f} ms; "
+                f"{s.overruns} overruns, {s.missed} missed, of {s.decisions}"
+            )
+
+    return DelayedPolicy()
+
+
+def main() -> None:
+    import rclpy
+    from rclpy.node import Node
+
+    from delayrl.deploy import load_bundle
+
+    rclpy.init()
+    parameters = Node("delayed_policy_parameters")
+    values = {
+        name: parameters.declare_parameter(name, default).value
+        for name, default in {"policy": "", "on_overrun": "hold", "action_delay": 0}.items()
+    }
+    try:
+        node = make_node(load_bundle(values.pop("policy")), **values)
+    except DelayRLError as error:
+        sys.exit(f"delayed_policy: {error}")
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        node.report()
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

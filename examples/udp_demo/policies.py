@@ -1,0 +1,108 @@
+"""What runs in the controller: a trained policy, the same one blind to the delay, or a model that needs no training."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from delayrl.deploy import Policy
+from delayrl.errors import DelayRLError
+
+
+class RunPolicy:
+    """The policy of a run folder, played by JAX.
+
+    Raises:
+        DelayRLError: not a run folder, or no good checkpoint.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import delayrl
+        from delayrl.envs import make
+        from delayrl.runs import Run
+
+        self._policy = delayrl.load(path)
+        spec = self._policy.spec
+        self.obs_size, self.action_size, self.max_age = spec.obs_size, spec.action_size, spec.delay
+        self.low, self.high = self._policy.low, self._policy.high
+        env = make(Run(path).config["env"])
+        self.dt: float | None = getattr(env.unwrapped, "dt", None)
+        env.close()
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        """In the task's units."""
+        return self._policy.act(obs, {"age": age, "actions": actions}).astype(np.float32)
+
+
+class Predictor:
+    """No learning: a linear model of the plant, the state predicted over the actions since, and an optimal gain (LQR).
+
+    The model is measured on the simulator, around standing still. It stands only if age and history are right.
+    """
+
+    def __init__(self, env: str = "InvertedPendulum-v5", max_age: int = 5) -> None:
+        import gymnasium as gym
+
+        task = gym.make(env, disable_env_checker=True)
+        plant: Any = task.unwrapped
+        task.reset(seed=0)
+        self.obs_size, self.action_size = task.observation_space.shape[0], task.action_space.shape[0]
+        self.low, self.high, self.dt, self.max_age = task.action_space.low, task.action_space.high, plant.dt, max_age
+
+        def step(state: np.ndarray, action: np.ndarray) -> np.ndarray:
+            plant.set_state(state[: plant.model.nq], state[plant.model.nq :])
+            return np.asarray(plant.step(action)[0], float)
+
+        size, small = self.obs_size, 1e-5
+        rest, still = np.zeros(size), np.zeros(self.action_size)
+        nudge = [(small * one, still) for one in np.eye(size)] + [
+            (rest, small * one) for one in np.eye(self.action_size)
+        ]
+        columns = [(step(rest + s, a) - step(rest - s, -a)) / (2 * small) for s, a in nudge]
+        self._A, self._B = np.array(columns[:size]).T, np.array(columns[size:]).T
+        task.close()
+        P = np.eye(size)
+        for _ in range(2000):  # the Riccati equation, by going round
+            gain = np.linalg.solve(0.1 * np.eye(self.action_size) + self._B.T @ P @ self._B, self._B.T @ P @ self._A)
+            P = np.eye(size) + self._A.T @ P @ (self._A - self._B @ gain)
+        self._gain = gain
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        """Predict, then act."""
+        for action in actions[:age]:
+            obs = self._A @ obs + self._B @ action
+        return np.clip(-self._gain @ obs, self.low, self.high).astype(np.float32)
+
+
+class Blind:
+    """A policy that takes every observation for current: of VDPO it is the reference, which learned without delay."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self.obs_size, self.action_size, self.dt = policy.obs_size, policy.action_size, policy.dt
+        self.low, self.high, self.max_age = policy.low, policy.high, 64
+        self._nothing = np.zeros((policy.max_age, policy.action_size), np.float32)
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        """As if the age were 0."""
+        return self._policy(obs, self._nothing, 0)
+
+
+def load(source: str, blind: bool = False) -> Policy:
+    """A policy by its source: a run folder, a bundle (`delayrl export`), or "predictor".
+
+    Raises:
+        DelayRLError: nothing of this kind is there.
+    """
+    policy: Policy
+    if source == "predictor":
+        policy = Predictor()
+    elif (Path(source) / "checkpoints").is_dir():
+        policy = RunPolicy(Path(source))
+    else:
+        try:
+            from delayrl.deploy import load_bundle
+        except ImportError:
+            raise DelayRLError(f"{source} is no run folder: train one with `delayrl train vdpo …`") from None
+        policy = load_bundle(source)
+    return Blind(policy) if blind else policy

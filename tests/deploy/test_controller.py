@@ -1,0 +1,442 @@
+"""The history that the controller keeps is the plant's, whatever the network does."""
+
+import dataclasses
+import math
+import os
+import subprocess
+import sys
+import threading
+from collections import Counter
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracle import Counting, Setting, draw_events, draw_setting, play
+
+from delayrl.deploy import ClockError, Controller, OverrunError, Statistics
+from delayrl.errors import DelayRLError
+from delayrl.wrappers import Delayed
+
+
+def fuzz(sequences: int, seed: int) -> Counter:
+    happened: Counter = Counter()
+    for number in range(sequences):
+        rng = np.random.default_rng([seed, number])
+        setting = draw_setting(rng)
+        events = draw_events(rng, setting, int(rng.integers(3, 25)))
+        try:
+            happened.update(play(setting, events))
+        except AssertionError as error:
+            raise AssertionError(f"sequence {number} of seed {seed}: {error}\n{setting}\n{events}") from error
+    return happened
+
+
+EVERYTHING = [
+    *("new", "late", "duplicate", "invalid", "future", "reset", "ClockError", "OverrunError", "DelayRLError"),
+    *(f"age {age}" for age in range(10)),
+]
+
+
+def test_random_event_sequences_against_the_oracle() -> None:
+    happened = fuzz(2_500, seed=1)
+    assert all(happened[name] > 100 for name in EVERYTHING), happened
+
+
+@pytest.mark.slow
+def test_100_000_random_event_sequences_against_the_oracle() -> None:
+    happened = fuzz(100_000, seed=0)
+    assert all(happened[name] > 5_000 for name in EVERYTHING), happened
+
+
+SETTINGS = st.builds(
+    lambda seconds, age, κ, overrun, idle: Setting(seconds, age, min(κ, age), overrun, idle),
+    st.booleans(),
+    st.integers(0, 4),
+    st.integers(0, 2),
+    st.sampled_from(["hold", "clip", "raise"]),
+    st.sampled_from([None, 7.0]),
+)
+EVENTS = st.one_of(
+    st.tuples(st.just("wait"), st.integers(-4, 24), st.just(0)),
+    st.tuples(st.just("observe"), st.integers(-8, 24), st.integers(0, 9)),
+    st.tuples(st.just("act"), st.just(0), st.integers(0, 1)),
+    st.tuples(st.just("override"), st.just(0), st.integers(0, 1)),
+    st.tuples(st.just("applied"), st.integers(-1, 5), st.just(0)),
+    st.tuples(st.just("reset"), st.just(0), st.integers(0, 1)),
+)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(SETTINGS, st.lists(EVENTS, max_size=40))
+def test_any_event_sequence_against_the_oracle(setting: Setting, events: list) -> None:
+    play(setting, events)
+
+
+class Recorder:
+    """A policy that keeps what it is shown; its actions are random, and the same for the same call."""
+
+    def __init__(self, env: gym.Env, max_age: int, dt: float | None = None) -> None:
+        self.obs_size, self.action_size = env.observation_space.shape[0], env.action_space.shape[0]
+        self.low, self.high, self.max_age, self.dt = env.action_space.low, env.action_space.high, max_age, dt
+        self.rng = np.random.default_rng(5)
+        self.shown: list = []
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        self.shown.append((obs, actions, age))
+        return self.rng.uniform(self.low, self.high).astype(np.float32)
+
+
+class Uniform:
+    """Travel times from 0 to `maximum` steps: late, overtaken, several at once."""
+
+    def __init__(self, maximum: int) -> None:
+        self.maximum = maximum
+
+    def draw(self, memory: int, random: np.random.Generator) -> tuple[int, int]:
+        return int(random.integers(0, self.maximum + 1)), memory
+
+
+@pytest.mark.parametrize("stamps", ["steps", "seconds"])
+@pytest.mark.parametrize("delay", [0, 1, 5, Uniform(4)])
+def test_shows_what_the_wrapper_shows(stamps: str, delay: object) -> None:
+    """The wrapper's shown observation goes through the network: here, one that brings all of them at random."""
+    env = Delayed(gym.make("Pendulum-v1"), delay)
+    policy = Recorder(env, env.law.maximum, dt=0.05)
+    controller = Controller(policy, stamps=stamps, on_overrun="raise")
+    rng = np.random.default_rng(0)
+    clock = 100.0
+    for episode in range(3):
+        clock += 10
+        controller.reset(clock if stamps == "seconds" else None)
+        obs, info = env.reset(seed=episode)
+        times, mailbox = [], {}
+        for step in range(60):
+            clock += 0.05 * rng.uniform(0.8, 1.2)  # an uneven control period
+            times.append(clock)
+            mailbox[step] = info["truth"]
+            shown = step - info["age"]
+            for k in rng.permutation([k for k in mailbox if k <= shown][-3:]):  # in any order, and again and again
+                stamp = times[k] - 0.015 * rng.random() if stamps == "seconds" else int(k)
+                if stamps == "steps" or k == shown:
+                    controller.observe(mailbox[k], stamp, clock if stamps == "seconds" else None)
+            action = controller.act(clock if stamps == "seconds" else None)
+            got_obs, got_actions, got_age = policy.shown[-1]
+            np.testing.assert_array_equal(got_obs, obs)
+            np.testing.assert_array_equal(got_actions, info["actions"])
+            assert got_age == info["age"]
+            obs, _, _, _, info = env.step(action)
+
+
+def counting(max_age: int = 3) -> Counting:
+    return Counting(1, max_age)
+
+
+def test_actions_are_counted_not_the_clock() -> None:
+    """A loop that runs at 0.7 of its nominal period: after five actions the age is 5, not round(5 · 0.7) = 4."""
+    policy = counting(8)
+    controller = Controller(policy, stamps="seconds", dt=0.1)
+    controller.observe([0.0], 0.0, 0.0)
+    for i in range(6):
+        controller.act(0.07 * i)
+    assert policy.calls[-1] == (0.0, [2, 3, 4, 5, 6, 0, 0, 0], 5)  # 1 was the first call, to warm up
+
+
+def test_missed_periods_are_in_the_history() -> None:
+    for idle, filled in ((None, 2.0), (0.0, 0.0)):
+        policy = counting(8)
+        controller = Controller(policy, stamps="seconds", dt=0.1, idle=None if idle is None else [idle])
+        controller.observe([0.0], 0.0, 0.0)
+        controller.act(0.0)
+        controller.act(0.41)  # the loop stalled for three periods
+        controller.act(0.5)
+        assert policy.calls[-1] == (0.0, [2, filled, filled, filled, 3, 0, 0, 0], 5)
+        assert controller.statistics.missed == 3
+
+
+def test_a_slow_first_call_costs_no_action() -> None:
+    """The policy compiles at its first call: that is over when the controller stands, and in no statistic."""
+    clock = [0.0]
+
+    class Slow(Counting):
+        def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+            clock[0] += 0.0 if self.calls else 5.0
+            return super().__call__(obs, actions, age)
+
+    policy = Slow(1, 3)
+    controller = Controller(policy, stamps="seconds", dt=0.1, clock=lambda: clock[0])
+    for i in range(6):
+        controller.observe([i], clock[0])
+        controller.act()
+        clock[0] += 0.1
+    assert [age for *_, age in policy.calls] == [0] * 7
+    assert controller.statistics.delay_mean == 0
+    assert controller.statistics.period_mean == pytest.approx(0.1)
+    assert controller.statistics.missed == 0
+
+
+def test_the_cold_start_is_not_in_the_effective_delay() -> None:
+    controller = Controller(counting(5))
+    for t in range(30):
+        if t >= 5 or t == 0:
+            controller.observe([t], max(0, t - 5))
+        controller.act()
+    got = controller.statistics
+    assert (got.age_mean, got.age_std, got.age_max, got.counted) == (5, 0, 5, 24)
+
+
+def test_an_observation_pushed_twice_is_one() -> None:
+    controller = Controller(counting())
+    assert [controller.observe([1.0], 0) for _ in range(3)] == ["new", "duplicate", "duplicate"]
+    controller.act()
+    assert controller.observe([2.0], 0) == "duplicate"
+
+
+def test_halfway_between_two_steps_is_the_later() -> None:
+    for offset, age in ((0.124, 2), (0.125, 1), (0.126, 1)):
+        policy = counting()
+        controller = Controller(policy, stamps="seconds", dt=0.25)
+        controller.observe([0.0], 0.0, 0.0)
+        controller.act(0.0)
+        controller.act(0.25)
+        controller.observe([1.0], 0.0 + offset, 0.5)
+        controller.act(0.5)
+        assert policy.calls[-1][2] == age
+
+
+@pytest.mark.parametrize("on_overrun", ["hold", "clip", "raise"])
+def test_overruns(on_overrun: str) -> None:
+    policy = counting(2)
+    controller = Controller(policy, on_overrun=on_overrun)
+    controller.observe([0.0], 0)
+    assert [controller.act()[0] for _ in range(3)] == [2, 3, 4]
+    if on_overrun == "raise":
+        with pytest.raises(OverrunError, match=r"ages 0\.\.2; the newest is 3 steps old"):
+            controller.act()
+        assert controller.step == 2  # nothing was recorded
+        controller.override([9.0])
+        controller.observe([1.0], 3)
+        controller.act()
+        assert policy.calls[-1] == (1.0, [9, 0], 1)
+    elif on_overrun == "hold":
+        assert [controller.act()[0] for _ in range(2)] == [4, 4]
+        controller.observe([1.0], 4)
+        controller.act()
+        assert policy.calls[-1] == (1.0, [4, 0], 1)
+    else:
+        controller.act()
+        assert policy.calls[-1] == (0.0, [2, 3], 2)
+        controller.act()
+        assert policy.calls[-1] == (0.0, [2, 3], 2)
+    assert controller.statistics.overruns == (1 if on_overrun == "raise" else 2)
+
+
+def test_what_the_plant_really_did() -> None:
+    policy = counting(4)
+    controller = Controller(policy)
+    controller.observe([0.0], 0)
+    for _ in range(3):
+        controller.act()
+    assert controller.applied([0.5], 1)
+    controller.applied([-0.5])
+    controller.act()
+    assert policy.calls[-1] == (0.0, [2, 0.5, -0.5, 0], 3)
+    with pytest.raises(DelayRLError, match="4 steps, from 0 on; got step 4"):
+        controller.applied([0.0], 4)
+
+
+def test_actions_in_flight_add_to_the_age() -> None:
+    """With κ = 2 the plant does the n-th action in step n + 2, and before that what it does by itself."""
+    policy = counting(4)
+    controller = Controller(policy, action_delay=2)
+    plant = [0.0, 0.0]  # what it does in step 0, 1, ...
+    for t in range(10):
+        controller.observe([t], t)
+        plant.append(float(controller.act()[0]))
+        assert policy.calls[-1] == (t, [*plant[t : t + 2], 0, 0], 2)
+
+
+def test_actions_lie_in_the_policys_range() -> None:
+    policy = counting()
+    policy.high = np.float32([2.5])
+    controller = Controller(policy)
+    controller.observe([0.0], 0)
+    assert [controller.act()[0] for _ in range(2)] == [2, 2.5]
+
+
+def test_episodes_do_not_mix() -> None:
+    policy = counting()
+    controller = Controller(policy)
+    controller.observe([0.0], 0)
+    controller.act()
+    controller.reset()
+    assert not controller.ready
+    assert controller.observe([8.0], 0, episode=0) == "late"  # still travelling when the episode ended
+    with pytest.raises(DelayRLError, match="wait until"):
+        controller.act()
+    controller.observe([9.0], 0, episode=1)
+    controller.act()
+    assert policy.calls[-1] == (9.0, [0, 0, 0], 0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.observe([1.0, 2.0], 0), "observations of size 1; got shape"),
+        (lambda c: c.observe(["a"], 0), "array of numbers"),
+        (lambda c: c.observe([1.0], 0.5), "whole numbers; got 0.5"),
+        (lambda c: c.observe([1.0], True), "a number of steps; got True"),
+        (lambda c: c.observe([1.0], "0"), "a number of steps"),
+        (lambda c: c.act(math.nan), "must be finite"),
+        (lambda c: c.act(-1), "steps count from 0"),
+        (lambda c: c.override([math.nan]), "1 finite numbers"),
+        (lambda c: c.applied([1.0]), "0 steps"),
+    ],
+)
+def test_mistakes_are_one_line_and_change_nothing(call, message: str) -> None:
+    controller = Controller(counting())
+    with pytest.raises(DelayRLError, match=message) as caught:
+        call(controller)
+    assert "\n" not in str(caught.value)
+    assert dataclasses.asdict(controller.statistics) == pytest.approx(
+        dataclasses.asdict(Controller(counting()).statistics), nan_ok=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stamps": "ticks"}, "in steps or in seconds"),
+        ({"on_overrun": "panic"}, "hold, clip or raise"),
+        ({"action_delay": -1}, "whole steps"),
+        ({"action_delay": 4}, "longest age, 3"),
+        ({"dt": 0.1}, "steps have no length"),
+        ({"stamps": "seconds", "dt": 0.0}, "give dt"),
+        ({"idle": [1.0, 2.0]}, "idle must be 1 finite"),
+    ],
+)
+def test_bad_settings_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(DelayRLError, match=message):
+        Controller(counting(), **arguments)
+
+
+def test_a_policy_may_scribble_on_what_it_is_shown() -> None:
+    class Scribbler(Counting):
+        def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+            action = super().__call__(obs, actions, age)
+            obs[:], actions[:] = -1, -1
+            return action
+
+    policy = Scribbler(1, 3)
+    controller = Controller(policy)
+    controller.observe([5.0], 0)
+    for _ in range(3):
+        controller.act()
+    assert policy.calls[-1] == (5.0, [2, 3, 0], 2)
+
+
+@pytest.mark.parametrize("on_overrun", ["hold", "clip"])
+def test_an_observation_older_than_the_memory(on_overrun: str) -> None:
+    """Long forgotten: still an overrun, `clip` has nothing to show and holds, and the age is no nonsense."""
+    controller = Controller(counting(2), stamps="seconds", dt=0.25, on_overrun=on_overrun)
+    controller.observe([1.0], 90.0, 90.0)  # 40 periods before the first command
+    for i in range(300):
+        action = controller.act(100 + 0.25 * i)
+    assert controller.statistics.overruns == 297
+    assert controller.statistics.counted == 0  # nothing newer than step 0 has arrived
+    controller.observe([1.0], 101.0, 180.0)
+    assert controller.act(100 + 0.25 * 300) == action
+    assert controller.statistics.age_max == 296
+    controller.act(1e9)  # a stall of many steps costs no memory
+    controller.observe([2.0], 1e9, 1e9)
+    controller.act(1e9 + 0.25)
+    assert controller.policy.calls[-1][0::2] == (2.0, 1)
+    with pytest.raises(DelayRLError, match="steps, from 0 on"):
+        controller.applied([0.0], controller.step + 1)
+    assert not controller.applied([0.0], 0)
+
+
+def test_a_policy_without_a_number_is_not_recorded() -> None:
+    policy = counting()
+    controller = Controller(policy)
+    controller.observe([0.0], 0)
+    controller.policy = lambda obs, actions, age: np.float32([np.nan])
+    controller.policy.action_size, controller.policy.max_age = 1, 3
+    with pytest.raises(DelayRLError, match="the policy's action must be"):
+        controller.act()
+    assert controller.step == -1
+
+
+def test_time_must_go_forward() -> None:
+    controller = Controller(counting(), stamps="seconds", dt=0.1)
+    controller.observe([0.0], 5.0, 5.0)
+    with pytest.raises(ClockError, match="an observation of 5 is here"):
+        controller.act(4.9)
+    controller.act(5.0)
+    for now in (5.0, 4.0, -math.inf):
+        with pytest.raises(ClockError):
+            controller.act(now)
+    controller.act(5.1)
+    assert controller.step == 1
+
+
+def test_two_threads() -> None:
+    """A network thread pours in observations, doubled and shuffled, while another acts: what is shown fits together."""
+    seen: list[tuple[float, list[float], int]] = []
+    given: list[float] = []  # step -> action
+
+    class Slow(Counting):
+        def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+            action = super().__call__(obs, actions, age)
+            seen.append(self.calls[-1])
+            finished.wait(0.0003)
+            return action
+
+    finished, broken = threading.Event(), []
+    controller = Controller(Slow(1, 6), on_overrun="hold")
+    controller.observe([0.0], 0)
+    seen.clear()
+
+    def network(seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        try:
+            while not finished.is_set():
+                newest = controller.step + 1
+                k = max(0, newest - int(rng.integers(0, 6)))
+                controller.observe([float(k)], k)  # s_k says k
+                assert isinstance(controller.statistics, Statistics)
+                finished.wait(1e-4)
+        except BaseException as error:
+            broken.append(error)
+
+    threads = [threading.Thread(target=network, args=(seed,)) for seed in range(3)]
+    for thread in threads:
+        thread.start()
+    try:
+        asked = []
+        for _ in range(400):
+            before = len(seen)
+            given.append(float(controller.act()[0]))
+            asked.append(seen[-1] if len(seen) > before else None)
+    finally:
+        finished.set()
+        for thread in threads:
+            thread.join(10)
+    assert not broken
+    assert not any(thread.is_alive() for thread in threads)
+    checked = 0
+    for n, call in enumerate(asked):
+        if call is not None:
+            k, actions, age = call
+            assert (age, actions) == (n - k, given[int(k) : n] + [0.0] * (6 - age))
+            checked += 1
+    assert checked > 200
+    got = controller.statistics
+    assert got.decisions == 400
+    assert got.new <= 401
+
+
+def test_needs_numpy_alone() -> None:
+    program = "import delayrl.deploy, sys; assert not {'jax', 'gymnasium', 'mujoco'} & set(sys.modules), sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True, env=os.environ)
