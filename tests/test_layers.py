@@ -19,7 +19,11 @@ ORDER = [
     "evaluation",
     "acting learning estimate",
     "training video",
-    "cli",
+    "experiments experiments.folders",
+    "experiments.grid experiments.worker",
+    "experiments.status experiments.runner",
+    "experiments.results experiments.slurm experiments.cluster",
+    "cli experiments.cli",
     "__main__",
 ]
 LAYER = {name: i for i, names in enumerate(ORDER) for name in names.split()}

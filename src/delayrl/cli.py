@@ -55,11 +55,17 @@ def _run(arguments: list[str]) -> None:
     watch.add_argument("--delay", type=_delay, help="another delay than the one it was trained for")
     watch.add_argument("--seed", type=int, default=0, help="of the start state (default: 0)")
 
+    commands.add_parser("bench", help="run a grid of agents, tasks, delays and seeds", add_help=False)
     commands.add_parser("agents", help="list the agents")
     commands.add_parser("tasks", help="list the tasks")
 
     if arguments[:1] == ["train"]:
         _train(arguments[1:])
+        return
+    if arguments[:1] == ["bench"]:
+        from delayrl.experiments.cli import bench
+
+        bench(arguments[1:])
         return
     given = parser.parse_args(arguments)
     {"evaluate": _evaluate, "watch": _watch, "agents": _agents, "tasks": _tasks}[given.command](given)
