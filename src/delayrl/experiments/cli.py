@@ -122,9 +122,8 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     print(f"{grid.name}: {len(report.done)} of {len(cells)} cells done")
     if report.failed:
         first = next(iter(report.failed.values()))
-        raise DelayRLError(
-            f"{len(report.failed)} cells failed, the first: {first} (`delayrl bench status` has them all)"
-        )
+        count = f"{len(report.failed)} of {len(cells)} cells failed"
+        raise DelayRLError(f"{count}, the first: {first} (`delayrl bench status` has them all)")
     if report.left:
         print("stopped at a checkpoint; the same command goes on")
         sys.exit(STOPPED)

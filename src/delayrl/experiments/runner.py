@@ -179,7 +179,8 @@ def work_off(
                 if now < not_before.get(cell.id, 0):
                     waiting.append(cell)
                     continue
-                reached.setdefault(cell.id, folders.stored(runs / cell.folder, cell.seeds)[0])
+                if cell.id not in reached:
+                    reached[cell.id] = folders.stored(runs / cell.folder, cell.seeds)[0]
                 backend.start(cell)
                 active += 1
             for cell, outcome in backend.ended():

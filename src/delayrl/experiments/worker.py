@@ -4,6 +4,7 @@ It holds the cell's lock, trains, and says on stdout in one line of JSON how tha
 it is sent SIGTERM, and when whoever started it is gone: its stdin is a pipe that closes then.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -69,16 +70,21 @@ def work(folder: Path, device: str | None = None) -> Outcome:
                 note(folder, "stopped", step=stored(folder, seeds)[0])
                 return Outcome("stopped", str(error))
             except DelayRLError as error:  # trying again would end in the same way
-                print(error, file=sys.stderr)
+                _log(str(error))
                 return Outcome("failed", str(error))
     except LockedError:
         return Outcome("locked", "another process works on it")
     except DelayRLError as error:
         return Outcome("failed", str(error))
     except Exception as error:
-        traceback.print_exc()
+        _log(traceback.format_exc())
         words = str(error).strip().splitlines()
         return Outcome("died", f"{type(error).__name__}: {words[0] if words else ''}".rstrip(": "))
+
+
+def _log(text: str) -> None:
+    with contextlib.suppress(OSError):  # the disk may be full
+        print(text, file=sys.stderr, flush=True)
 
 
 def _stop_with_parent() -> None:
