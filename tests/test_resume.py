@@ -6,13 +6,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import killing
 import numpy as np
 import pytest
-from killing import KilledError, moments, options
 
 import delayrl
+import killing
 from delayrl.runs import Run
+from killing import KilledError, moments, options
 
 AGENTS = ("sac", "bpql", "vdpo")
 

@@ -221,7 +221,9 @@ def short_pause(monkeypatch) -> None:
 def test_tries_are_bounded(tmp_path: Path) -> None:
     """Only those in a row that store nothing new count; a mistake is not tried again; the others go on."""
     backend = Script(sac=[DIED] * 9, bpql=[DIED, DIED, DONE], vdpo=[WRONG, DONE])
+    began = time.monotonic()
     report = work_off(cells("sac", "bpql", "vdpo"), tmp_path, backend, tries=3)
+    assert time.monotonic() - began > 2 + 4  # longer from time to time
     assert [backend.started.count(agent) for agent in ("sac", "bpql", "vdpo")] == [3, 3, 1]
     assert [cell.agent for cell in report.done] == ["bpql"]
     assert report.failed == {"sac": "3 tries stored nothing new; the last: killed by SIGKILL", "vdpo": "discount: no"}

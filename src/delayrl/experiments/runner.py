@@ -206,6 +206,7 @@ def work_off(
                     not_before[cell.id] = now + 2
                 else:
                     waiting.append(cell)
+                    not_before[cell.id] = now + 2 * in_vain[cell.id]  # what killed it may still be there
                     say(f"again from step {step:,}: {cell}: {line}")
             tick()
             time.sleep(PAUSE)

@@ -1,7 +1,7 @@
 """Slurm: a grid as an array job.
 
-Each element runs one cell with the local runner, is told before its time is up, stores a checkpoint and puts itself
-into the queue again. Slurm does the same for an element whose node failed.
+Each element runs one cell with the local runner. When its time is up, or Slurm asks it to stop, it stores a checkpoint
+and puts itself into the queue again. Slurm does that for an element whose node failed.
 """
 
 import math
@@ -26,7 +26,7 @@ SCRIPT = """#!/bin/bash
 #SBATCH --signal=B:TERM@{before}
 #SBATCH --requeue
 #SBATCH --open-mode=append
-#SBATCH --output={log}
+#SBATCH --output="{log}"
 {extra}
 # Written by `delayrl bench run {name} --backend slurm`.
 cells=({ids})
@@ -67,6 +67,8 @@ def script(
     """
     source = grid.name if grid.is_shipped else str(grid.source.resolve())
     words = [sys.executable, "-m", "delayrl", "bench", "run", source, "--runs", str(runs.resolve()), *arguments]
+    limit = HOUR if time_limit is None else time_limit
+    words += ["--time-limit", f"{int(limit)}s"]
     before = int(GRACE) + 30
     for option in options:
         if not option.startswith("-") or "\n" in option:
@@ -74,7 +76,7 @@ def script(
     return SCRIPT.format(
         name=grid.name,
         last=len(cells) - 1,
-        minutes=math.ceil(((HOUR if time_limit is None else time_limit) + before) / 60),
+        minutes=math.ceil((limit + before) / 60),
         before=before,
         log=runs.resolve() / "slurm" / f"{grid.name}-%a.log",
         extra="\n".join(f"#SBATCH {option}" for option in options),
