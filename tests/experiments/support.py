@@ -77,4 +77,4 @@ def worker_of(folder: Path) -> int | None:
     """The process that holds a cell."""
     who = folders.holder(folder)
     words = who.split() if who else []
-    return int(words[1]) if len(words) == 2 else None
+    return int(words[-1]) if words and words[-1].isdigit() else None
