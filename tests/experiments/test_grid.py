@@ -223,6 +223,8 @@ def test_two_grids_of_one_name(tmp_path: Path) -> None:
         load_grid(write(tmp_path, BASIC)),
         load_grid(write(tmp_path / "other", BASIC + "protocol='official'")),
     )
+    claim(runs, mine.name, mine.source, mine.ids, look=True)
+    assert not runs.exists()
     claim(runs, mine.name, mine.source, mine.ids)
     with pytest.raises(delayrl.DelayRLError, match="two grids are named 'grid'"):
         claim(runs, theirs.name, theirs.source, theirs.ids)

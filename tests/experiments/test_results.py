@@ -153,6 +153,10 @@ def test_worker(finished, tmp_path: Path) -> None:
     before = (home / "journal.jsonl").read_text()
     assert work(home) == Outcome("done", "")
     assert (home / "journal.jsonl").read_text() == before
+    (home / "journal.jsonl").write_text(before.splitlines(keepends=True)[0])  # killed before it could say "done"
+    for _ in range(2):
+        assert work(home) == Outcome("done", "")
+        assert [event["event"] for event in folders.journal(home)] == ["begun", "done"]
     with folders.hold(home):
         assert work(home).kind == "locked"
         assert status(grid.cells[0], runs) == "running"
@@ -209,3 +213,4 @@ def test_bad_commands(words: str, expected: str, tmp_path: Path, monkeypatch, ca
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert expected in captured.err
+    assert list(tmp_path.iterdir()) == []

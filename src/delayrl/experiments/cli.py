@@ -63,7 +63,7 @@ def bench(arguments: list[str]) -> None:
     given = parser.parse_args(arguments)
     grid = load_grid(given.grid)
     if given.command != "plan":
-        folders.claim(given.runs, grid.name, grid.source, grid.ids, grid.is_shipped)
+        _claim(grid, given, look=True)
     {"plan": _plan, "run": _run, "status": _status, "collect": _collect}[given.command](grid, given)
 
 
@@ -96,6 +96,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     cells = _chosen(grid, given.cells)
     _at_least_one("--tries", given.tries)
     _at_least_one("--workers", given.workers)
+    _claim(grid, given, look=False)
     if given.backend == "slurm":
         _slurm(grid, cells, given)
         return
@@ -141,6 +142,10 @@ def _slurm(grid: Grid, cells: Sequence[Cell], given: argparse.Namespace) -> None
     file = slurm.write(grid, left, given.runs, text)
     print(f"{file}: {len(left)} cells")
     print(f"submitted as job {slurm.submit(file)}" if given.submit else f"next: sbatch {file}")
+
+
+def _claim(grid: Grid, given: argparse.Namespace, look: bool) -> None:
+    folders.claim(given.runs, grid.name, grid.source, grid.ids, grid.is_shipped, look)
 
 
 def _chosen(grid: Grid, ids: list[str] | None) -> list[Cell]:

@@ -152,8 +152,8 @@ def prepare(folder: Path, cell: Any) -> None:
         raise DelayRLError(f"cannot write to {folder}: {error.strerror}") from error
 
 
-def claim(runs: Path, name: str, source: Path, ids: list[str], shipped: bool = False) -> None:
-    """Remember which file a grid's name stands for; an edited file keeps its name.
+def claim(runs: Path, name: str, source: Path, ids: list[str], shipped: bool = False, look: bool = False) -> None:
+    """Remember which file a grid's name stands for (or only `look`); an edited file keeps its name.
 
     Raises:
         DelayRLError: another file with other cells has used the name here.
@@ -167,8 +167,9 @@ def claim(runs: Path, name: str, source: Path, ids: list[str], shipped: bool = F
                 f"two grids are named {name!r}: {have['source']} (seen from {runs}) has used the name there; "
                 f'give this one another name = "…", or another --runs'
             )
-        if have == {"source": here, "cells": ids}:
-            return
+        look = look or have == {"source": here, "cells": ids}
+    if look:
+        return
     try:
         record.parent.mkdir(parents=True, exist_ok=True)
         draft = record.with_name(f".{name}-{os.getpid()}.draft")

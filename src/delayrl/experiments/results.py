@@ -57,14 +57,14 @@ def collect(grid: Grid, runs: Path, out: Path) -> int:
             name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
         if name != grid.name:
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
+    if next(rows_of(grid.cells, runs), None) is None:
+        raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
     draft = out.with_name(f".{out.name}.draft")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         draft.unlink(missing_ok=True)
         with contextlib.closing(sqlite3.connect(draft)) as table:
             count = _fill(table, grid, runs)
-        if not count:
-            raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
         draft.replace(out)
     except (OSError, sqlite3.OperationalError) as error:
         raise DelayRLError(f"cannot write {out}: {error}") from error

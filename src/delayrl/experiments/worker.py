@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from delayrl.errors import DelayRLError, StoppedError
-from delayrl.experiments.folders import LockedError, hold, note, seed_folders, stored
+from delayrl.experiments.folders import LockedError, hold, journal, note, seed_folders, stored
 
 Kind = Literal["done", "stopped", "failed", "died", "locked"]
 
@@ -44,6 +44,8 @@ def work(folder: Path, device: str | None = None) -> Outcome:
             seeds = tuple(cell["seeds"])
             step, complete = stored(folder, seeds)
             if complete:
+                if not any(event["event"] == "done" for event in journal(folder)[-1:]):
+                    note(folder, "done")  # its worker was killed before it could say so
                 return Outcome("done", "")
             from delayrl.provenance import versions
             from delayrl.training import train
