@@ -12,7 +12,7 @@ from delayrl.cli import main
 from delayrl.experiments import folders
 from delayrl.experiments.grid import Cell, Grid, load_grid
 from delayrl.experiments.results import collect, read_table, rows_of
-from delayrl.experiments.status import status
+from delayrl.experiments.status import standing, status
 from delayrl.experiments.worker import Outcome, work
 from delayrl.runs import Run
 
@@ -56,10 +56,10 @@ def test_round_trip(finished, tmp_path: Path) -> None:
     assert len(expected) == 2 * 2 * 2
     assert expected[0] | {"cell": grid.cells[0].id} == expected[0]
     assert collect(grid, runs, tmp_path / "mixed.sqlite") == len(expected)
-    rows, cells, states = read_table(tmp_path / "mixed.sqlite")
+    rows, cells = read_table(tmp_path / "mixed.sqlite")
     assert rows == expected
-    assert cells == list(grid.cells)
-    assert states == {grid.cells[0].id: "done", grid.cells[1].id: "todo"}
+    assert cells == standing(grid.cells, runs)
+    assert [(p.state, p.step) for _, p in cells] == [("done", 60), ("todo", 0)]
     assert [status(cell, runs) for cell in grid.cells] == ["done", "todo"]
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from delayrl.errors import DelayRLError
 from delayrl.experiments import folders
+from delayrl.experiments.folders import Progress
 from delayrl.experiments.grid import Cell, Grid
 from delayrl.experiments.status import progress
 from delayrl.runs import Run
@@ -112,18 +113,20 @@ def _versions(folder: Path) -> list[dict[str, Any]]:
     return [event["versions"] for event in folders.journal(folder) if "versions" in event]
 
 
-def read_table(file: Path) -> tuple[list[Row], list[Cell], dict[str, str]]:
-    """Rows, cells and states (by cell id) of a collected table.
+def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]]]:
+    """Rows of a collected table, and its cells with how far they were.
 
     Raises:
         DelayRLError: no table of ours, or of another schema version.
     """
     with _reading(file) as table:
-        cells, states = [], {}
-        for key, text, state in table.execute("SELECT id, cell, state FROM cells ORDER BY number"):
+        cells = []
+        for key, text, *state in table.execute(
+            "SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number"
+        ):
             values = json.loads(text)
-            cells.append(Cell(**(values | {"seeds": tuple(values["seeds"]), "id": key})))
-            states[key] = state
+            cell = Cell(**(values | {"seeds": tuple(values["seeds"]), "id": key}))
+            cells.append((cell, Progress(*state, "")))
         shared = {
             run: json.loads(text) | {"cell": cell}
             for run, cell, text in table.execute("SELECT id, cell, shared FROM runs")
@@ -133,7 +136,7 @@ def read_table(file: Path) -> tuple[list[Row], list[Cell], dict[str, str]]:
             shared[run] | dict(zip(OWN, values, strict=True)) | (json.loads(more) if more else {})
             for run, more, *values in table.execute(f"SELECT run, more, {columns} FROM rows")
         ]
-    return rows, cells, states
+    return rows, cells
 
 
 @contextlib.contextmanager
