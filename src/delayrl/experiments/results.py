@@ -121,12 +121,11 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]]]:
     """
     with _reading(file) as table:
         cells = []
-        for key, text, *state in table.execute(
-            "SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number"
-        ):
+        columns = "id, cell, state, step, steps_per_second"
+        for key, text, state, step, speed in table.execute(f"SELECT {columns} FROM cells ORDER BY number"):
             values = json.loads(text)
             cell = Cell(**(values | {"seeds": tuple(values["seeds"]), "id": key}))
-            cells.append((cell, Progress(*state, "")))
+            cells.append((cell, Progress(state, step, speed, "")))
         shared = {
             run: json.loads(text) | {"cell": cell}
             for run, cell, text in table.execute("SELECT id, cell, shared FROM runs")
