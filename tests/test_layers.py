@@ -26,12 +26,14 @@ ORDER = [
     "deploy",
     "acting learning estimate",
     "training video",
-    "experiments",
-    "experiments.statistics",
+    "experiments experiments.statistics experiments.folders",
     "experiments.summary",
     "experiments.figures",
     "experiments.report",
-    "cli",
+    "experiments.grid experiments.worker",
+    "experiments.status experiments.runner",
+    "experiments.results experiments.slurm experiments.cluster",
+    "cli experiments.cli",
     "__main__",
 ]
 LAYER = {name: i for i, names in enumerate(ORDER) for name in names.split()}

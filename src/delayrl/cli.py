@@ -81,6 +81,7 @@ def _run(arguments: list[str]) -> None:
     pull.add_argument("--revision", help="a branch, tag or commit")
     pull.add_argument("--force", action="store_true", help="replace a bundle that lies there")
 
+    commands.add_parser("bench", help="run a grid of agents, tasks, delays and seeds", add_help=False)
     commands.add_parser("agents", help="list the agents")
     commands.add_parser("tasks", help="list the tasks")
 
@@ -92,6 +93,11 @@ def _run(arguments: list[str]) -> None:
 
         command.add_options(measure)
         command.run(parser.parse_args(arguments))
+        return
+    if arguments[:1] == ["bench"]:
+        from delayrl.experiments.cli import bench
+
+        bench(arguments[1:])
         return
     given = parser.parse_args(arguments)
     {

@@ -118,7 +118,7 @@ class Run:
                     _write(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
             for later in (self.path / "checkpoints").glob("[0-9]*"):
                 if int(later.name) > step:
-                    shutil.rmtree(later)
+                    _forget(later)
 
     def checkpoints(self) -> tuple[list[Checkpoint], list[str]]:
         """The good checkpoints, newest first, and one line for each broken one."""
@@ -160,7 +160,7 @@ class Run:
             manifest = {"step": step, "complete": complete, "files": digests, "pieces": pieces}
             _write(draft / "manifest.json", json.dumps(manifest).encode())
             if final.exists():
-                shutil.rmtree(final)
+                _forget(final)
             draft.rename(final)
         for old in sorted(home.glob("[0-9]*"))[:-2]:
             shutil.rmtree(old, ignore_errors=True)
@@ -226,6 +226,14 @@ def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
                 f"{list(arrays[name].shape)}, expected {leaf.dtype}{list(leaf.shape)}"
             )
     return jax.tree_util.tree_unflatten(form, [arrays[name] for name in named])
+
+
+def _forget(checkpoint: Path) -> None:
+    """Delete a checkpoint at once: a crash in the middle leaves no half of it under its name."""
+    gone = checkpoint.with_name(".gone")
+    shutil.rmtree(gone, ignore_errors=True)
+    checkpoint.rename(gone)
+    shutil.rmtree(gone)
 
 
 def _digest(path: Path) -> str:

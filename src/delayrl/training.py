@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ from tqdm import tqdm
 from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
-from delayrl.agents.base import Agent, Schedule, template
+from delayrl.agents.base import Agent, Schedule, State, template
 from delayrl.config import check_names, override, values_of
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make, physics
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, StoppedError
 from delayrl.estimate import estimate_seconds
 from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, check_seed, reset_seed
 from delayrl.learning import compiled
@@ -40,6 +40,7 @@ from delayrl.provenance import versions
 from delayrl.runs import Arrays, Checkpoint, Run, flatten_tree, load_arrays, restore_tree
 from delayrl.tracking import Tracker
 from delayrl.types import Metrics, Spec, Transition
+from delayrl.wrappers import Delayed
 
 Note = Callable[[str], None]
 METRICS_EVERY = 1000
@@ -85,19 +86,11 @@ def train(
     Raises:
         DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
     """
-    entry = find_agent(agent)
-    if preset not in entry.presets:
-        raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(entry.presets)}")
+    config, schedule = resolve(agent, preset, protocol, values)
     if seeds < 1:
         raise DelayRLError(f"seeds must be at least 1; got {seeds}")
     check_seed(seed)
     check_seed(seed + seeds - 1)
-    if protocol not in ("corrected", "official"):
-        raise DelayRLError(f"protocol must be corrected or official; got {protocol!r}")
-    base = entry.presets[preset]
-    check_names(values, base.agent, base.schedule)
-    values = (dict(entry.official) if protocol == "official" else {}) | values
-    config, schedule = override(base.agent, values), override(base.schedule, values)
     kind = f"{agent}-{preset}" if protocol == "corrected" else f"{agent}-{preset}-{protocol}"
     late = delay_of(env, delay)
     folder = re.sub(r"[^\w.=+@-]+", "-", f"{env}-delay{late.label()}")
@@ -108,7 +101,7 @@ def train(
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
     with on_device(device):
         official = protocol == "official"
-        whole = config.ahead if official and entry.drops_last_starts else None
+        whole = config.ahead if official and find_agent(agent).drops_last_starts else None
         session = Session(config, schedule, env, late, [seed + i for i in range(seeds)], official, whole)
         description = {
             "agent": agent,
@@ -145,17 +138,7 @@ class Session:
         ]
         self.spec = spec_of(self.actors[0].env)
         self.physics = physics(self.actors[0].env)
-        least = 2 * (self.spec.delay + agent.ahead(self.spec)) + 2
-        if schedule.replay_capacity < least:
-            raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
-        if schedule.random_steps < least:
-            raise DelayRLError(f"random_steps must be at least {least} here; got {schedule.random_steps}")
-        task = self.actors[0].env.spec
-        if task is None or task.max_episode_steps is None:
-            raise DelayRLError(f"{env} has no time limit, so evaluation may never end; register it with one")
-        if check := getattr(agent, "check", None):
-            check(schedule)
-        self.template = template(agent, self.spec)  # says what does not fit, before anything is stored
+        self.template = check_fit(agent, schedule, self.actors[0].env)  # before anything is stored
         self.program = compiled(agent, self.spec, whole(self.spec) if whole else 1)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step, self.learning = 0, False
@@ -321,7 +304,7 @@ class Session:
                     self.save(complete=self.step == schedule.steps)
             if stop.is_set() and self.step < schedule.steps:
                 self.save()
-                raise DelayRLError(f"stopped at step {self.step:,}; the same command goes on from there")
+                raise StoppedError(f"stopped at step {self.step:,}; the same command goes on from there")
         self._draw()
 
     def _draw(self) -> None:
@@ -437,6 +420,35 @@ def find_agent(name: str) -> Any:
         near = difflib.get_close_matches(name, AGENTS, n=2, cutoff=0.4) or AGENTS
         raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")
     return AGENTS[name]
+
+
+def resolve(agent: str, preset: str, protocol: str, values: Mapping[str, Any]) -> tuple[Agent, Schedule]:
+    """The hyperparameters and the schedule that a name, a preset, a protocol and some values stand for."""
+    entry = find_agent(agent)
+    if preset not in entry.presets:
+        raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(entry.presets)}")
+    if protocol not in ("corrected", "official"):
+        raise DelayRLError(f"protocol must be corrected or official; got {protocol!r}")
+    base = entry.presets[preset]
+    check_names(values, base.agent, base.schedule)
+    values = (dict(entry.official) if protocol == "official" else {}) | dict(values)
+    return override(base.agent, values), override(base.schedule, values)
+
+
+def check_fit(agent: Agent, schedule: Schedule, env: Delayed) -> State:
+    """DelayRLError where agent, schedule and delayed task do not fit; shapes and types of the agent's state."""
+    spec, task = spec_of(env), env.spec
+    least = 2 * (spec.delay + agent.ahead(spec)) + 2
+    if schedule.replay_capacity < least:
+        raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
+    if schedule.random_steps < least:
+        raise DelayRLError(f"random_steps must be at least {least} here; got {schedule.random_steps}")
+    if task is None or task.max_episode_steps is None:
+        name = task.id if task else "the task"
+        raise DelayRLError(f"{name} has no time limit, so evaluation may never end; register it with one")
+    if check := getattr(agent, "check", None):
+        check(schedule)
+    return template(agent, spec)
 
 
 @contextmanager

@@ -114,7 +114,8 @@ class Entry(NamedTuple):
 
 def template(agent: Agent, spec: Spec) -> State:
     """Shapes and types of the agent's state, without computing it. Raises what `init` raises."""
-    return jax.eval_shape(functools.partial(agent.init, spec), jax.random.key(0))
+    key = jax.eval_shape(lambda: jax.random.key(0))  # a shape too: no device is touched
+    return jax.eval_shape(functools.partial(agent.init, spec), key)
 
 
 def descend(

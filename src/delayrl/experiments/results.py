@@ -1,0 +1,165 @@
+"""Rows of a grid, from its run folders or from the table that is published.
+
+The table is one SQLite file: Python reads and writes it without another library, so does most other software, it is
+queried where it lies, and it keeps doubles and whole numbers exactly. What holds for a run stands once. The same
+rows give the same bytes, so that a committed table changes only where results do.
+"""
+
+import contextlib
+import json
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from delayrl.errors import DelayRLError
+from delayrl.experiments import folders
+from delayrl.experiments.folders import Progress
+from delayrl.experiments.grid import Cell, Grid
+from delayrl.experiments.status import progress
+from delayrl.runs import Run
+
+SCHEMA = 1
+Row = dict[str, Any]
+OWN = ("step", "policy", "episode", "reset_seed", "return", "length")
+"""What differs between the rows of a run; the rest stands once for each run."""
+TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE cells (id TEXT PRIMARY KEY, number INTEGER, cell TEXT, state TEXT, step INTEGER, steps_per_second REAL);
+CREATE TABLE runs (id INTEGER PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, seed INTEGER NOT NULL,
+                   shared TEXT NOT NULL, config TEXT NOT NULL, versions TEXT NOT NULL);
+CREATE TABLE rows (run INTEGER NOT NULL REFERENCES runs, step INTEGER, policy TEXT, episode INTEGER,
+                   reset_seed INTEGER, return REAL, length INTEGER, more TEXT,
+                   PRIMARY KEY (run, step, policy, episode)) WITHOUT ROWID;
+CREATE VIEW results AS
+    SELECT cell, json_extract(shared, '$.agent') AS agent, json_extract(shared, '$.env') AS env,
+           json_extract(shared, '$.delay') AS delay, seed, step, policy, episode, reset_seed, return, length
+    FROM rows JOIN runs ON rows.run = runs.id;
+"""
+
+
+def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
+    """Rows of the cells as the run folders hold them now, each with its cell's id."""
+    for cell in cells:
+        for path in folders.seed_folders(runs / cell.folder, cell.seeds):
+            for row in Run(path).read("rows"):
+                yield row | {"cell": cell.id}
+
+
+def collect(grid: Grid, runs: Path, out: Path) -> int:
+    """Write what a grid has now into a table; returns the number of rows.
+
+    Raises:
+        DelayRLError: no rows yet, a damaged run, a row that is there twice, `out` is the table of another grid.
+    """
+    if out.exists():
+        with _reading(out) as table:
+            name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
+        if name != grid.name:
+            raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
+    if next(rows_of(grid.cells, runs), None) is None:
+        raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
+    draft = out.with_name(f".{out.name}.draft")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        draft.unlink(missing_ok=True)
+        with contextlib.closing(sqlite3.connect(draft)) as table:
+            count = _fill(table, grid, runs)
+        draft.replace(out)
+    except (OSError, sqlite3.OperationalError) as error:
+        raise DelayRLError(f"cannot write {out}: {error}") from error
+    finally:
+        draft.unlink(missing_ok=True)
+    return count
+
+
+def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
+    count = 0
+    table.executescript("PRAGMA page_size = 4096; PRAGMA journal_mode = OFF;" + TABLES)
+    meta = {"schema": str(SCHEMA), "grid": grid.name, "description": grid.description}
+    table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+    for number, cell in enumerate(grid.cells):
+        p = progress(cell, runs)
+        text = _json({key: value for key, value in vars(cell).items() if key != "id"})
+        table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", (cell.id, number, text, p.state, p.step, p.speed))
+        used = _versions(runs / cell.folder)
+        for path, seed in zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True):
+            rows = Run(path).read("rows")
+            if not rows:
+                continue
+            config = dict(Run(path).config)
+            first = config.pop("versions", None)
+            versions = [v for v in ([first] if first else []) + used]
+            distinct = [v for i, v in enumerate(versions) if v not in versions[:i]]
+            shared = {k: v for k, v in rows[0].items() if k not in OWN and all(row.get(k) == v for row in rows)}
+            values = (cell.id, seed, _json(shared), _json(config), _json(distinct))
+            run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", values).lastrowid
+            for row in rows:
+                more = {k: v for k, v in row.items() if k not in OWN and k not in shared}
+                line = (run, *(row[name] for name in OWN), _json(more) if more else None)
+                try:
+                    table.execute("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", line)
+                except sqlite3.IntegrityError as error:
+                    raise DelayRLError(f"{path} holds an episode twice: step {row['step']}, {row['policy']}") from error
+                count += 1
+    table.commit()
+    table.execute("VACUUM")
+    return count
+
+
+def _versions(folder: Path) -> list[dict[str, Any]]:
+    """With what a cell was worked on: more than one where it went on elsewhere, or after an update."""
+    return [event["versions"] for event in folders.journal(folder) if "versions" in event]
+
+
+def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]]]:
+    """Rows of a collected table, and its cells with how far they were.
+
+    Raises:
+        DelayRLError: no table of ours, or of another schema version.
+    """
+    with _reading(file) as table:
+        cells = []
+        columns = "id, cell, state, step, steps_per_second"
+        for key, text, state, step, speed in table.execute(f"SELECT {columns} FROM cells ORDER BY number"):
+            values = json.loads(text)
+            cell = Cell(**(values | {"seeds": tuple(values["seeds"]), "id": key}))
+            cells.append((cell, Progress(state, step, speed, "")))
+        shared = {
+            run: json.loads(text) | {"cell": cell}
+            for run, cell, text in table.execute("SELECT id, cell, shared FROM runs")
+        }
+        columns = ", ".join(OWN)
+        rows = [
+            shared[run] | dict(zip(OWN, values, strict=True)) | (json.loads(more) if more else {})
+            for run, more, *values in table.execute(f"SELECT run, more, {columns} FROM rows")
+        ]
+    return rows, cells
+
+
+@contextlib.contextmanager
+def _reading(file: Path) -> Iterator[sqlite3.Connection]:
+    if not file.is_file():
+        raise DelayRLError(f"there is no table {file}; `delayrl bench collect GRID` makes one")
+    try:
+        with contextlib.closing(sqlite3.connect(f"file:{_quoted(file)}?mode=ro", uri=True)) as table:
+            version = table.execute("SELECT value FROM meta WHERE key = 'schema'").fetchone()
+            if version is None or version[0] != str(SCHEMA):
+                have = version[0] if version else "none"
+                raise DelayRLError(
+                    f"{file} has schema version {have}, this program reads {SCHEMA}: collect it again with this version"
+                )
+            yield table
+    except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
+        raise DelayRLError(f"{file} is no table of results, or damaged: {error}") from error
+
+
+def _quoted(file: Path) -> str:
+    from urllib.parse import quote
+
+    return quote(os.fspath(file.resolve()))
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, sort_keys=True)
