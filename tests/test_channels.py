@@ -85,10 +85,7 @@ def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[
             truth.append(truth[-1])
         now = t + 1
         looked = counts("observation", now, send("observation", now))
-        if looked >= 0:
-            shown = looked
-        elif fill == "first":
-            shown = 0
+        shown = looked if looked >= 0 or fill == "zeros" else 0
         over = end is None and now == length
         if not delay.reward.maximum:
             reward, finish = 2.0**t, (over and not truncates, over and truncates)
@@ -296,3 +293,66 @@ def test_augmented_state_of_random_actions() -> None:
         assert x[-1] == pytest.approx(info["applied"] / 2)
         late.add(info["applied"])
     assert late == {0, 1, 2}
+
+
+class Whole(Journal):
+    observation_space = gym.spaces.Box(-100, 100, (2,), np.int64)
+
+
+def test_whole_observations_do_not_cut_actions() -> None:
+    env = AugmentedObservation(Delayed(Whole(20), 2))
+    env.reset(seed=0)
+    for _ in range(3):
+        x, *_ = env.step(np.float32([0.75]))
+    assert x[2:].tolist() == [0.75, 0.75, 1.0]
+
+
+def test_the_time_limit_is_not_late() -> None:
+    """The true end comes at 9, its news would at 15; the time limit of 10 ends the waiting, and pays everything."""
+    gym.register("Journal-v0", lambda: Journal(9), max_episode_steps=10)
+    env = Delayed(gym.make("Journal-v0"), "1+reward=6")
+    gym.registry.pop("Journal-v0")
+    env.reset(seed=0)
+    rewards, ends = [], []
+    for _ in range(10):
+        _, reward, terminated, truncated, _ = env.step(np.float32([0]))
+        rewards.append(reward)
+        ends.append((terminated, truncated))
+    assert ends[-2:] == [(False, False), (True, True)]
+    assert sum(rewards) == 2.0**9 - 1
+
+
+def test_an_episode_is_told_of_once() -> None:
+    """The task's own info of its last step is not repeated until the news arrives."""
+    env = Delayed(gym.wrappers.RecordEpisodeStatistics(Journal(5)), "1+reward=4")
+    env.reset(seed=0)
+    assert sum("episode" in env.step(np.float32([0]))[4] for _ in range(9)) == 1
+
+
+def test_idle_is_zero_in_the_tasks_units() -> None:
+    class Gas(Journal):
+        action_space = gym.spaces.Box(0, 10, (1,))
+
+    gym.register("Gas-v0", lambda: Gas(20), max_episode_steps=30)
+    try:
+        for rescale in (False, True):
+            env = delayrl.make("Gas-v0", "action=2", rescale=rescale)
+            env.reset(seed=0)
+            env.step(np.float32([1]))
+            assert env.unwrapped.acted == [0.0]  # type: ignore[attr-defined]
+    finally:
+        gym.registry.pop("Gas-v0")
+
+
+def test_one_delay_is_enough() -> None:
+    with pytest.raises(delayrl.DelayRLError, match="delayed already"):
+        Delayed(AugmentedObservation(Delayed(Journal(5), 1)), 2)
+    with pytest.raises(delayrl.DelayRLError, match="takes a vector"):
+        DelayedVector(Journal(5), 2)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("delay", [2, "uniform:1:3@fifo+action=1", as_delay("walk:3")])
+def test_made_again_from_its_specification(delay: object) -> None:
+    env = Delayed(gym.make("Pendulum-v1"), delay)  # type: ignore[arg-type]
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.get_wrapper_attr("delay") == env.delay

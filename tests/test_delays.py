@@ -65,7 +65,7 @@ def drawn(law: object, count: int, seed: int = 0) -> list[int]:
 def test_text_round_trip(delay: Delay) -> None:
     assert as_delay(delay.plain()) == delay
     assert as_delay(str(delay)) == delay
-    assert len(str(delay.label())) <= len(str(delay.plain()))
+    assert len(str(delay.label())) <= max(len(str(delay.plain())), 12)
 
 
 @given(LAWS, st.integers(0, 5), st.integers(0, 100))
@@ -178,9 +178,19 @@ def test_channels_of_a_text() -> None:
         ("gamma:100:1:3", "never below"),
         ("5@soon", "newest, fifo, raw"),
         ("80ms", "no `dt`"),
-        ("1+2", "two for the observations"),
+        ("1+2", "is no number"),
+        ("1+observation=2", "two for the observations"),
         ("2+reward=3@raw", "newest or fifo"),
         ("recorded:nowhere.csv", "No such file"),
+        ("recorded:a+b@c.csv", "a\\+b@c.csv"),
+        ("recorded", "unknown delay"),
+        ("recorded:" + "9" * 5000 + ",", "No such file|too long"),
+        ("1e400", "is no number|finite|whole"),
+        ("gamma:1e-200:1:5", "between"),
+        ("gamma:1:1e200:5", "between"),
+        ("walk:100000", "1 to 1000 states"),
+        ("walk:8:0.5s", "no unit"),
+        ("choice:1=0.5s,2=0.5", "no unit"),
     ],
 )
 def test_bad_texts(text: str, words: str) -> None:
@@ -207,12 +217,45 @@ def test_bad_recordings(content: str, words: str, tmp_path: Path) -> None:
         recorded(tmp_path / "trace.csv")
 
 
+def test_recordings_in_odd_forms(tmp_path: Path) -> None:
+    (tmp_path / "bom.csv").write_bytes("\ufeff3\r\n1\r\n4\r\n".encode())
+    assert recorded(tmp_path / "bom.csv") == Recorded((3, 1, 4))
+    (tmp_path / "quoted.csv").write_text('time,"delay"\n0,"3"\n1,"1"\n\n')
+    assert recorded(tmp_path / "quoted.csv") == Recorded((3, 1))
+    np.save(tmp_path / "table.npy", np.array([[100.0, 3.0], [101.0, 4.0]]))
+    assert recorded(tmp_path / "table.npy") == Recorded((3, 4))
+    (tmp_path / "a+b@c=d.csv").write_text("2\n")
+    assert as_delay(f"recorded:{tmp_path / 'a+b@c=d.csv'}+action=1").maximum == 3
+    np.save(tmp_path / "complex.npy", np.array([1j]))
+    np.savez(tmp_path / "zip.npz", a=np.ones(2))
+    (tmp_path / "zip.npz").rename(tmp_path / "zip.npy")
+    huge = (
+        b"\x93NUMPY\x01\x00v\x00"
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117)
+        + b"\n"
+    )
+    (tmp_path / "huge.npy").write_bytes(huge)
+    for name in ("complex.npy", "zip.npy", "huge.npy"):
+        with pytest.raises(DelayRLError, match="cannot be read"):
+            recorded(tmp_path / name)
+
+
+def test_what_a_newcomer_types() -> None:
+    assert Delay(observation=3, action="2") == as_delay("3+action=2")  # type: ignore[arg-type]
+    assert Channel(3) == Channel(Constant(3))  # type: ignore[arg-type]
+    assert as_delay(" 2 + action = 1 ") == as_delay("2+action=1")
+    with pytest.raises(DelayRLError, match="as_delay"):
+        Channel("uniform:1:3")  # type: ignore[arg-type]
+    assert poisson(1000, 3).probabilities[3] > 0.99
+    assert len(str(as_delay("choice:" + ",".join(f"{i}={1 / 50!r}" for i in range(50))).label())) < 60
+
+
 def test_recordings_are_data(tmp_path: Path) -> None:
     """A .npy file with pickled objects is refused, and nothing in it runs."""
     np.save(tmp_path / "trace.npy", np.array([object()]), allow_pickle=True)
     (tmp_path / "cut.npy").write_bytes(b"\x93NUMPY")
     for name in ("trace.npy", "cut.npy"):
-        with pytest.raises(DelayRLError, match="must be numbers"):
+        with pytest.raises(DelayRLError, match="cannot be read"):
             recorded(tmp_path / name)
 
 

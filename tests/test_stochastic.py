@@ -14,6 +14,7 @@ import delayrl
 from conftest import TINY, record
 from delayrl import cli
 from delayrl import replay as ring
+from delayrl.acting import Actor
 from delayrl.delays import Channel, Constant, Delay, as_delay
 from delayrl.evaluation import evaluate
 from delayrl.learning import Program
@@ -27,7 +28,7 @@ DELAYED = [name for name in TINY if name != "sac"]
 STOCHASTIC = "uniform:1:3@raw"
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(CHANNELS, st.integers(0, 2), st.integers(0, 99))
 def test_round_trip(channel: Channel, lag: int, seed: int) -> None:
     """What the wrapper showed is what `view` makes of the replay, now and k steps later, for every law and rule."""
@@ -74,11 +75,13 @@ def test_every_agent_learns_under_random_delays(name: str) -> None:
     assert not all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True))
 
 
-@pytest.mark.parametrize("delay", ["3", "uniform:0:3", "uniform:1:2+action=1", "1+reward=4"])
-def test_what_may_be_missing_is_hidden(delay: str) -> None:
-    """An overtaken observation may arrive late: nothing newer than the longest delay is learned from, honestly."""
+@pytest.mark.parametrize(
+    ("delay", "longest"),
+    [("3", 3), ("uniform:0:3", 3), ("uniform:1:2+action=1", 3), ("1+reward=4", 4), ("1+action=3+reward=4", 7)],
+)
+def test_what_may_be_missing_is_hidden(delay: str, longest: int) -> None:
+    """An overtaken observation may arrive late, and an action acts before its reward sets out."""
     late = as_delay(delay)
-    longest = max(late.maximum, late.reward.maximum)
     for name in ("bpql", "vdpo"):
         schedule = delayrl.AGENTS[name].presets["small"].schedule
         session = Session(TINY[name], schedule, "Reacher-v5", late, [0])
@@ -151,6 +154,35 @@ def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (run.path / "delays.png").stat().st_size > 5000
     with pytest.raises(SystemExit):
         cli.main(["evaluate", str(run.path), "--sweep", "--delay", "2"])
+
+
+def test_official_episodes_have_their_own_travel_times() -> None:
+    """One start state, as in the released code; but not one sequence of delays."""
+    actor = Actor(delayrl.make("delayrl/Counter-v0", "uniform:0:4", rescale=True), 0, False, official=True)
+    actor.reset()
+    ages: list[list[int]] = [[]]
+    for _ in range(300):
+        done = actor.step(np.zeros(1, np.float32)).done
+        ages[-1].append(int(actor.seen.age))
+        if done:
+            ages.append([])
+    whole = {tuple(a) for a in ages[:-1]}
+    assert len(whole) > len(ages) // 2
+
+
+def test_custom_laws_are_refused_in_training(tmp_path: Path) -> None:
+    class Mine:
+        maximum = 2
+
+        def draw(self, memory: int, random: np.random.Generator) -> tuple[int, int]:
+            return 2, memory
+
+        def shifted(self, steps: int) -> "Mine":
+            return self
+
+    with pytest.raises(delayrl.DelayRLError, match=r"delayrl\.delays|is no number"):
+        train("a-sac", tmp_path / "run", delay=Delay(Channel(Mine())))  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
 
 
 def test_random_action_delays_are_refused_in_training(tmp_path: Path) -> None:

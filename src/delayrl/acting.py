@@ -30,7 +30,10 @@ class Actor:
         """Start the next episode, from its own seed (official protocol: always from the same)."""
         self.actions = []
         seed = self.seed if self.official else reset_seed(self.seed, TRAINING, self.episode)
-        self._see(*self.env.reset(seed=seed))
+        shown = self.env.reset(seed=seed)
+        if self.official:  # one start state, but not one sequence of travel times
+            self.env.draw_from(reset_seed(self.seed, TRAINING, self.episode))
+        self._see(*shown)
 
     def step(self, action: NDArray[np.float32]) -> Transition:
         """Act; start the next episode where this one ends."""

@@ -200,7 +200,13 @@ def _evaluate(given: argparse.Namespace) -> None:
     if given.sweep:
         if given.delay is not None:
             raise DelayRLError("--sweep plays every delay; leave --delay out")
-        _sweep(given, sweep(given.run, given.episodes, given.seed))
+        from tqdm import tqdm
+
+        from delayrl.policy import load
+
+        delays = load(given.run).spec.delay + 1
+        bar = tqdm(sweep(given.run, given.episodes, given.seed), total=delays, unit="delay", disable=given.json)
+        _sweep(given, list(bar))
         return
     result = evaluate(given.run, given.episodes, given.delay, given.seed)
     if given.json:

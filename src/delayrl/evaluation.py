@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from delayrl.agents.base import Agent, State
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
 from delayrl.errors import DelayRLError
-from delayrl.policy import load
+from delayrl.policy import Policy, load
 from delayrl.runs import Run
 from delayrl.types import Action, Key, Seen, Spec
 from delayrl.views import seen_now
@@ -42,9 +42,7 @@ class Evaluator:
     """
 
     def __init__(self, agent: Agent, spec: Spec, env: str, delay: int | str | Delay, seeds: int, episodes: int) -> None:
-        late = delay_of(env, delay).acted()
-        if late.maximum > spec.delay:
-            raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {late.maximum}")
+        late = servable(env, delay, spec)
         self._delay = spec.delay
         self._envs = [[make(env, late, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
         self._act = _compiled_act(agent)
@@ -55,14 +53,21 @@ class Evaluator:
         reset_seeds: Sequence[Sequence[int]],
         keys: Key,
         first: NDArray[np.float32] | None = None,
+        travel: Sequence[Sequence[int]] | None = None,
     ) -> Episodes:
-        """Play one episode from each reset seed, [seeds, episodes]; with `first` for the first actions, [.., .., A]."""
+        """Play one episode from each reset seed, [seeds, episodes].
+
+        With `first` for the first actions, [.., .., A], and travel times from the seeds `travel`, if these are given.
+        """
         shape = (len(self._envs), len(self._envs[0]))
         returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
         seen = [
             [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
+        for envs, seeds in zip(self._envs, travel or (), strict=False):
+            for env, seed in zip(envs, seeds, strict=True):
+                env.draw_from(seed)
         step = 0
         while running.any():
             batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
@@ -83,6 +88,14 @@ class Evaluator:
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
         return seen_now(obs, info, self._delay, privileged=False)
+
+
+def servable(env: str, delay: int | str | Delay, spec: Spec) -> Delay:
+    """The delay without that of rewards; DelayRLError where its ages are longer than a policy was trained for."""
+    late = delay_of(env, delay).acted()
+    if late.maximum > spec.delay:
+        raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {late.maximum}")
+    return late
 
 
 @functools.cache
@@ -131,11 +144,22 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
+    policy, config = load(run), Run(Path(run)).config
+    return _play(policy, config, config["delay"] if delay is None else delay, episodes, seed)
+
+
+def sweep(run: str | Path, episodes: int = 10, seed: int = 0) -> Iterator[dict[str, Any]]:
+    """`evaluate` at every constant delay from 0 to the longest age that the policy was trained for."""
+    policy, config = load(run), Run(Path(run)).config
+    for delay in range(policy.spec.delay + 1):
+        yield _play(policy, config, delay, episodes, seed)
+
+
+def _play(policy: Policy, config: dict[str, Any], delay: int | str, episodes: int, seed: int) -> dict[str, Any]:
     if episodes < 1:
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
     check_seed(seed)
-    policy, config = load(run), Run(Path(run)).config
-    late = delay_of(config["env"], config["delay"] if delay is None else delay)
+    late = delay_of(config["env"], delay)
     evaluator = Evaluator(policy.agent, policy.spec, config["env"], late, 1, episodes)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
@@ -149,8 +173,3 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None
         "std_return": float(returns.std()),
         "returns": returns.tolist(),
     }
-
-
-def sweep(run: str | Path, episodes: int = 10, seed: int = 0) -> list[dict[str, Any]]:
-    """`evaluate` at every constant delay from 0 to the longest age that the policy was trained for."""
-    return [evaluate(run, episodes, delay, seed) for delay in range(load(run).spec.delay + 1)]

@@ -84,7 +84,7 @@ class Run:
             for name in ("checkpoints", "replay", "tensorboard", "wandb"):
                 if (self.path / name).exists():
                     shutil.rmtree(self.path / name)
-            for name in ("rows.jsonl", "metrics.jsonl", "curve.png", "config.json"):
+            for name in ("rows.jsonl", "metrics.jsonl", "curve.png", "delays.png", "config.json"):
                 (self.path / name).unlink(missing_ok=True)
 
     def is_free(self) -> bool:

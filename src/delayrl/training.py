@@ -28,7 +28,7 @@ from delayrl.acting import Actor
 from delayrl.agents import AGENTS
 from delayrl.agents.base import Agent, Schedule, State, template
 from delayrl.config import check_names, override, values_of
-from delayrl.delays import Delay
+from delayrl.delays import Delay, as_delay
 from delayrl.envs import delay_of, make, physics
 from delayrl.errors import DelayRLError, StoppedError
 from delayrl.estimate import estimate_seconds
@@ -93,6 +93,10 @@ def train(
     check_seed(seed + seeds - 1)
     kind = f"{agent}-{preset}" if protocol == "corrected" else f"{agent}-{preset}-{protocol}"
     late = delay_of(env, delay)
+    if as_delay(late.plain()) != late:
+        raise DelayRLError(
+            f"a run keeps its delay as text, and {str(late)[:60]!r} cannot be read back: use delayrl.delays"
+        )
     folder = re.sub(r"[^\w.=+@-]+", "-", f"{env}-delay{late.label()}")
     group = Path(out) if out is not None else Path("runs") / folder / kind
     single_home = group if out is not None else group / f"seed{seed}"
@@ -346,7 +350,9 @@ class Session:
 
         Of what is older than the longest delay everything has, even what was overtaken.
         """
-        longest = 0 if self.agent.privileged else max(self.spec.delay, self.delay.reward.maximum)
+        late = self.delay
+        longest = late.action.maximum + max(late.observation.maximum, late.reward.maximum)
+        longest = 0 if self.agent.privileged else longest
         return np.array([min(len(actor.actions), longest) for actor in self.actors], np.int32)
 
     def _evaluators(self) -> dict[str, Evaluator]:
@@ -364,7 +370,7 @@ class Session:
         summary = []
         episodes = range(self.schedule.evaluation_episodes)
         seeds = [[reset_seed(seed, EVALUATION, self.step, e) for e in episodes] for seed in self.seeds]
-        first = None
+        first, travel = None, seeds
         if self.official:  # one start state for all episodes, and a random first action under delay
             draw = [
                 [np.random.default_rng(number).uniform(-1, 1, self.spec.action_size) for number in s] for s in seeds
@@ -372,7 +378,9 @@ class Session:
             first, seeds = np.array(draw, np.float32), [[seed] * len(episodes) for seed in self.seeds]
         keys = jax.vmap(lambda key: jax.random.fold_in(key, self.step))(self.keys)
         for policy, evaluator in evaluators.items():
-            played = evaluator(states[policy], seeds, keys, first if policy == "agent" and self.spec.delay else None)
+            played = evaluator(
+                states[policy], seeds, keys, first if policy == "agent" and self.spec.delay else None, travel
+            )
             summary.append(f"{policy} {played.returns.mean():.4g}")
             for i, (run, tracker) in enumerate(zip(self.runs, trackers, strict=True)):
                 run.append("rows", [self._row(i, policy, e, seeds[i][e], played) for e in episodes])

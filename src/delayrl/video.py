@@ -28,13 +28,14 @@ def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
     import imageio
 
-    from delayrl.envs import delay_of, make
+    from delayrl.envs import make
+    from delayrl.evaluation import servable
     from delayrl.policy import load
     from delayrl.runs import Run
 
     config = Run(run).config
     policy = load(run)
-    late = delay_of(config["env"], config["delay"] if delay is None else delay).acted()
+    late = servable(config["env"], config["delay"] if delay is None else delay, policy.spec)
     env = make(config["env"], late, render_mode="rgb_array")
     obs, info = env.reset(seed=reset_seed(seed, HELD_OUT, 0))
     frames, total, done = [], 0.0, False

@@ -166,8 +166,7 @@ class DCAC:
         # ages are known up to the window's last row; and after a termination, where nothing else is left to arrive
         true_still = (window.age[delay + 1 :] > slots) & ((slots < window.lead) | over)
         steps = jnp.cumprod(true_still.astype(jnp.int32)).sum()
-        # what has been received stays so, where a later look goes back in time (arrival rule raw)
-        newest = jax.lax.cummax(delay + jnp.arange(delay + 1) - window.age[delay:])
+        newest = delay + jnp.arange(delay + 1) - window.age[delay:]
         received = jnp.concatenate([jnp.zeros(1), jnp.cumsum(window.reward)])  # [c]: all before r_c
         first = jnp.where(late, delay - window.lead, 0)
         x, x_last = (network_input(view(replace(window, action=actions), i), "augmented") for i in (first, steps))

@@ -1,9 +1,7 @@
-"""Delay laws: how many environment steps a message travels; and which message counts when several are on their way.
+"""Channels: a law of travel times, and which message counts when several are on their way; and delays as text.
 
-A *law* says how long each observation, action or reward travels. It is a frozen value; what it must remember between
-two draws is one integer that its user keeps, 0 at the start of an episode. A `Channel` is a law with an arrival rule,
-a `Delay` is a channel for each of observations, actions and rewards. All of them can be written as text, and `str`
-gives the text back:
+A `Channel` is a law with an arrival rule, a `Delay` is a channel for each of observations, actions and rewards. All of
+them can be written as text, and `str` gives the text back:
 
     5                       every observation is 5 steps late
     80ms, 0.08s             the same in time, where the task says how long a step is: rounded up to whole steps
@@ -12,6 +10,7 @@ gives the text back:
     poisson:3:8             Poisson of mean 3, cut at 8
     gamma:3:1.5:8           gamma of mean 3 and standard deviation 1.5, rounded up to whole steps, cut at 8
     gilbert:1:6:0.05:0.3    a network that is good (1 step) or bad (6): it worsens with 0.05, recovers with 0.3
+    markov:0,5:0.9,0.1/0.5,0.5  a chain of two states with delays 0 and 5, and its transitions row by row
     walk:8, walk:8:0.5      a random walk on 0..8 that moves with probability 2/3 (or 0.5)
     recorded:trace.csv      measured delays, from a random place on; recorded:trace.csv:ms where they are times
     uniform:1:5@fifo        a rule: newest (the default), fifo or raw
@@ -59,6 +58,10 @@ class Channel:
     rule: Rule = "newest"
 
     def __post_init__(self) -> None:
+        if isinstance(self.law, str):
+            raise DelayRLError(f"a text may name a rule too: write as_delay({self.law!r}), or Delay({self.law!r})")
+        if not isinstance(self.law, DelayLaw):
+            object.__setattr__(self, "law", Constant(self.law))
         if self.rule not in get_args(Rule):
             raise DelayRLError(f"an arrival rule is one of {', '.join(get_args(Rule))}; got {self.rule!r}")
 
@@ -94,9 +97,14 @@ class Delay:
     reward: Channel = Channel()
 
     def __post_init__(self) -> None:
-        for name in ("observation", "action", "reward"):  # no delay is no delay, however it is written
-            if not getattr(self, name).maximum:
-                object.__setattr__(self, name, Channel())
+        for name in ("observation", "action", "reward"):
+            channel = getattr(self, name)
+            if isinstance(channel, str):
+                channel = _parse_channel(channel, channel, None)
+            elif not isinstance(channel, Channel):
+                channel = Channel(channel)
+            # no delay is no delay, however it is written
+            object.__setattr__(self, name, channel if channel.maximum else Channel())
         if self.reward.rule == "raw" and self.reward.maximum:
             raise DelayRLError("rewards arrive as newest or fifo: with raw some would be lost and others come twice")
 
@@ -132,11 +140,11 @@ class Delay:
         return int(text) if text.isdecimal() else text
 
     def label(self) -> int | str:
-        """`plain`, with a long recording shortened to its checksum: for rows and names of folders."""
+        """`plain`, with long lists of numbers shortened to its checksum: for rows and names of folders."""
         plain = self.plain()
         if isinstance(plain, int):
             return plain
-        return re.sub(r"[\d,]{40,}", lambda m: hashlib.sha256(m[0].encode()).hexdigest()[:12], plain)
+        return re.sub(r"[\d,./=e-]{40,}", lambda m: hashlib.sha256(m[0].encode()).hexdigest()[:12], plain)
 
     def __str__(self) -> str:
         parts = [str(self.observation)]
@@ -167,8 +175,9 @@ def as_delay(delay: "float | str | DelayLaw | Channel | Delay", step_seconds: fl
 
 def _parse(text: str, step_seconds: float | None) -> Delay:
     channels: dict[str, Channel] = {}
-    for part in text.strip().split("+"):
-        name, found, rest = part.partition("=")
+    for part in re.split(r"\+(?=\s*(?:observation|action|reward)\s*=)", text):
+        part = part.strip()
+        name, found, rest = (word.strip() for word in part.partition("="))
         if not found or name not in ("observation", "action", "reward"):
             name, rest = "observation", part
         if name in channels:
@@ -178,7 +187,9 @@ def _parse(text: str, step_seconds: float | None) -> Delay:
 
 
 def _parse_channel(part: str, text: str, step_seconds: float | None) -> Channel:
-    head, found, rule = part.partition("@")
+    head, found, rule = part.rpartition("@")
+    if not found or (part.startswith("recorded:") and rule not in get_args(Rule)):  # a path may have an @
+        head, found, rule = part, "", "newest"
     if head in PRESETS:
         return replace(PRESETS[head], rule=rule) if found else PRESETS[head]  # type: ignore[arg-type]
     kind, *words = head.split(":")
@@ -194,7 +205,10 @@ def _parse_channel(part: str, text: str, step_seconds: float | None) -> Channel:
         return whole(int(number) if number.is_integer() else number)
 
     def probability(word: str) -> float:
-        return _split(word, text)[0]
+        number, unit = _split(word, text)
+        if unit:
+            raise DelayRLError(f"a probability has no unit; got {word!r} in the delay {text!r}")
+        return number
 
     shapes: dict[
         str, tuple[Any, tuple[Any, ...], int]
@@ -219,21 +233,22 @@ def _parse_channel(part: str, text: str, step_seconds: float | None) -> Channel:
         law = Markov(tuple(steps(s) for s in words[0].split(",")), rows)
     elif kind == "recorded" and words:
         file = ":".join(words)
-        if re.fullmatch(r"(\d+,)+\d*", file):
+        if re.fullmatch(r"(\d{1,9},)+(\d{1,9})?", file):
             law = Recorded(tuple(int(word) for word in file.split(",") if word))
         else:
             unit = words[-1] if len(words) > 1 and words[-1] in ("s", "ms") else ""
             law = recorded(file.removesuffix(f":{unit}") if unit else file, step_seconds, unit)
-    elif words:
+    elif words or kind in ("choice", "markov", "recorded", *shapes):
         raise DelayRLError(f"unknown delay {head!r} ({_FORMS})")
     else:
         law = Constant(steps(head))
-    return Channel(law, rule if found else "newest")  # type: ignore[arg-type]
+    return Channel(law, rule)  # type: ignore[arg-type]
 
 
 _FORMS = (
     "a delay is 5, 80ms, uniform:1:5, choice:1=0.1,5=0.9, poisson:MEAN:MAX, gamma:MEAN:DEVIATION:MAX, "
-    f"gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, recorded:FILE, {', '.join(PRESETS)}; then @newest, @fifo or @raw"
+    "gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, markov:0,5:0.9,0.1/0.5,0.5, recorded:FILE, "
+    f"{', '.join(PRESETS)}; then @newest, @fifo or @raw"
 )
 
 

@@ -6,6 +6,7 @@ an episode. `str` of a law is text that `as_delay` reads.
 
 import itertools
 import math
+import re
 from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,9 +26,9 @@ def whole(steps: Any) -> int:
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
         raise DelayRLError(f"a delay counts whole environment steps; got {steps!r}")
     if steps < 0:
-        raise DelayRLError(f"a delay cannot be negative; got {steps}")
+        raise DelayRLError(f"a delay cannot be negative; got {steps:g}")
     if steps > LONGEST:
-        raise DelayRLError(f"a delay of {steps} steps is longer than we can hold ({LONGEST})")
+        raise DelayRLError(f"a delay of {float(steps):g} steps is longer than we can hold ({LONGEST})")
     return int(steps)
 
 
@@ -133,6 +134,7 @@ class Markov:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "steps", tuple(whole(steps) for steps in self.steps))
+        _check_states(len(self.steps))
         object.__setattr__(self, "transitions", tuple(_distribution(row) for row in self.transitions))
         if {len(self.transitions), *map(len, self.transitions)} != {len(self.steps)}:
             raise DelayRLError(f"{len(self.steps)} states need a square table of {len(self.steps)} transitions each")
@@ -156,7 +158,11 @@ class Markov:
         """The share of messages in each state in the long run."""
         chain = np.array(self.transitions)
         size = len(chain)
-        start = np.linalg.lstsq(np.vstack([chain.T - np.eye(size), np.ones(size)]), np.eye(size + 1)[-1], rcond=None)[0]
+        balance = np.vstack([(chain.T - np.eye(size))[:-1], np.ones(size)])  # the last equation follows from the others
+        try:
+            start = np.linalg.solve(balance, np.eye(size)[-1])
+        except np.linalg.LinAlgError:  # a chain that falls apart has more than one: any of them
+            start = np.linalg.lstsq(balance, np.eye(size)[-1], rcond=None)[0]
         return tuple((np.clip(start, 0, None) / np.clip(start, 0, None).sum()).tolist())
 
     @cached_property
@@ -209,13 +215,17 @@ def poisson(mean: float, maximum: int) -> Choice:
     """Poisson, cut at `maximum`: the probabilities of 0..maximum, scaled to sum to 1."""
     mean = _positive(mean, "the mean of a Poisson delay")
     steps = tuple(range(whole(maximum) + 1))
-    weights = np.exp([k * math.log(mean) - mean - math.lgamma(k + 1) for k in steps])
-    return Choice(steps, _scaled(weights), name=f"poisson:{_text(mean)}:{maximum}")
+    log_weights = np.array([k * math.log(mean) - math.lgamma(k + 1) for k in steps])
+    return Choice(steps, _scaled(np.exp(log_weights - log_weights.max())), name=f"poisson:{_text(mean)}:{maximum}")
 
 
 def gamma(mean: float, deviation: float, maximum: int) -> Choice:
     """Gamma of this mean and standard deviation (in steps, not whole), rounded up to whole steps, cut at `maximum`."""
     mean, deviation = _positive(mean, "the mean of a gamma delay"), _positive(deviation, "its standard deviation")
+    if not 1e-3 <= deviation / mean <= 1e3:
+        raise DelayRLError(
+            f"a gamma delay's deviation must be between 1/1000 and 1000 means; got {deviation:g}, {mean:g}"
+        )
     shape, scale = (mean / deviation) ** 2, deviation**2 / mean
     edges = [_gamma_below(shape, k / scale) for k in range(whole(maximum) + 1)]
     weights = np.clip(np.diff(edges, prepend=0.0), 0, None)  # rounding errors of the series
@@ -233,6 +243,7 @@ def gilbert_elliott(good: int, bad: int, worsen: float, recover: float) -> Marko
 def random_walk(maximum: int, move: float = 2 / 3) -> Markov:
     """A walk on 0..maximum: with probability `move` a step up or down, equally likely; at an end it stays instead."""
     size = whole(maximum) + 1
+    _check_states(size)
     chain = np.eye(size) * (1 - move)
     for state, step in itertools.product(range(size), (-1, 1)):
         chain[state, min(max(state + step, 0), maximum)] += move / 2
@@ -251,29 +262,41 @@ def recorded(path: str | Path, step_seconds: float | None = None, unit: str = ""
     Raises:
         DelayRLError: no such file, nothing in it, or anything but finite numbers of at least 0.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     try:
-        if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False).astype(float).ravel().tolist()
-        else:
-            cells = [line.split(",")[-1].strip() for line in path.read_text().splitlines() if line.strip()]
-            if cells and not is_number(cells[0]):
-                cells = cells[1:]
-            values = [float(cell) for cell in cells]
+        cells = _cells(path)
     except OSError as error:
         raise DelayRLError(f"cannot read the recorded delays {path}: {error.strerror or error}") from error
-    except (ValueError, EOFError, TypeError, UnicodeDecodeError) as error:
-        raise DelayRLError(f"{path}: recorded delays must be numbers; {str(error).splitlines()[0]}") from error
-    if not values:
+    except (ValueError, EOFError, UnicodeDecodeError) as error:
+        raise DelayRLError(f"{path} cannot be read as recorded delays: {str(error).splitlines()[0]}") from error
+    if not cells:
         raise DelayRLError(f"{path} holds no delays: it is empty")
-    bad = next((value for value in values if not (math.isfinite(value) and value >= 0)), None)
-    if bad is not None:
-        raise DelayRLError(f"{path}: recorded delays must be finite and not negative; got {bad:g}")
-    if unit:
-        return Recorded(tuple(rounded_up(in_steps(value, unit, step_seconds)) for value in values))
-    if odd := next((value for value in values if not value.is_integer()), None):
-        raise DelayRLError(f"{path}: {odd:g} is no whole number of steps; for times write recorded:{path}:ms or :s")
-    return Recorded(tuple(int(value) for value in values))
+    steps = []
+    for place, cell in cells:
+        if not is_number(cell):
+            raise DelayRLError(f"{path}, {place}: recorded delays must be numbers; got {cell[:40]!r}")
+        value = float(cell)
+        if not (math.isfinite(value) and value >= 0):
+            raise DelayRLError(f"{path}, {place}: recorded delays must be finite and not negative; got {value:g}")
+        if not unit and not value.is_integer():
+            raise DelayRLError(
+                f"{path}, {place}: {value:g} is no whole number; for times write recorded:{path}:ms or :s"
+            )
+        steps.append(rounded_up(in_steps(value, unit, step_seconds)))
+    return Recorded(tuple(steps))
+
+
+def _cells(path: Path) -> list[tuple[str, str]]:
+    """(where, what) of each recorded value, as text."""
+    if path.suffix == ".npy":
+        array = np.load(path, allow_pickle=False, mmap_mode="r")  # mapped: its header may promise what is not there
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf" or array.ndim > 2:
+            raise ValueError("not an array of numbers with one or two axes")
+        column = array if array.ndim < 2 else array[:, -1]
+        return [(f"entry {i}", repr(value)) for i, value in enumerate(np.atleast_1d(column).astype(float).tolist())]
+    lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
+    cells = [(f"line {i}", line.split(",")[-1].strip().strip('"')) for i, line in lines if line.strip()]
+    return cells[1:] if cells and not is_number(cells[0][1]) else cells
 
 
 def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
@@ -281,22 +304,32 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     if not unit:
         return number
     if not step_seconds:
-        raise DelayRLError("this task does not say how long a step is (it has no `dt`): give the delay in steps")
+        raise DelayRLError(
+            "this task does not say how long a step is (it has no `dt`): give the delay in steps, or step_seconds"
+        )
     return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds
 
 
 def rounded_up(steps: float) -> int:
     """What arrives between two steps is seen at the later one; a millionth of a step is rounding error."""
+    if not math.isfinite(steps):
+        raise DelayRLError(f"a delay must be finite; got {steps:g} steps")
     return whole(math.ceil(steps - 1e-6) if steps > 0 else math.floor(steps))
 
 
 def is_number(text: str) -> bool:
-    """Whether Python reads it as one."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    """Whether it is one (nan and inf too, for which there are better words)."""
+    return bool(
+        re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", text.strip(), re.IGNORECASE)
+    )
+
+
+MOST_STATES = 1000
+
+
+def _check_states(count: int) -> None:
+    if not 0 < count <= MOST_STATES:
+        raise DelayRLError(f"a Markov chain of delays has 1 to {MOST_STATES} states; got {count}")
 
 
 def _positive(number: float, what: str) -> float:
@@ -327,6 +360,8 @@ def _gamma_below(shape: float, x: float) -> float:
     """P(X ≤ x) of a gamma distribution of scale 1, by the series of the lower incomplete gamma function."""
     if x <= 0:
         return 0.0
+    if x > shape + 40 * math.sqrt(shape) + 100:  # all of it; the series would overflow
+        return 1.0
     term = total = 1 / shape
     n = 0
     while term > total * 1e-16:

@@ -16,13 +16,20 @@ from delayrl.delays import Channel, Delay, DelayLaw
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError
 from delayrl.wrappers import Delayed, check_spaces
+from delayrl.wrappers.transit import Fill
 
 probe.register()
 paper.register()
 
 
 def make(
-    env: str, delay: float | str | DelayLaw | Channel | Delay = 0, *, rescale: bool = False, **options: Any
+    env: str,
+    delay: float | str | DelayLaw | Channel | Delay = 0,
+    *,
+    rescale: bool = False,
+    history: int | None = None,
+    fill: Fill = "first",
+    **options: Any,
 ) -> Delayed:
     """A Gymnasium task with a delay.
 
@@ -30,6 +37,8 @@ def make(
         env: an id of Gymnasium's registry, e.g. "InvertedPendulum-v5".
         delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; shorter than an episode.
         rescale: take (and show in `info`) actions in [-1, 1] instead of the task's own range.
+        history: rows of the action history, as `Delayed`.
+        fill: what is shown before anything has arrived, as `Delayed`.
         **options: go to `gymnasium.make`, e.g. `render_mode="rgb_array"`.
 
     Raises:
@@ -45,9 +54,12 @@ def make(
         hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists the tasks we know"
         raise DelayRLError(f"unknown task {env!r}; {hint}") from error
     check_spaces(env, task.observation_space, task.action_space)
+    idle = None
     if rescale:
+        low, high = task.action_space.low, task.action_space.high  # type: ignore[attr-defined]
+        idle = 2 * (np.clip(0, low, high) - low) / (high - low) - 1
         task = RescaleAction(task, np.float32(-1), np.float32(1))
-    return Delayed(task, delay)
+    return Delayed(task, delay, history, fill, idle)
 
 
 def delay_of(env: str, delay: float | str | DelayLaw | Channel | Delay) -> Delay:

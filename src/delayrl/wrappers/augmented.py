@@ -29,10 +29,12 @@ def _space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, 
     # a slot without an action holds zeros, which the action's own bounds need not contain
     low, high = np.minimum(actions.low, 0), np.maximum(actions.high, 0)
     numbers = 1 if delay.action.constant else 2
+    # whole numbers, as observations may be, would cut actions and age
+    dtype = np.promote_types(observations.dtype, np.float32)  # type: ignore[arg-type]
     return Box(
-        np.concatenate([observations.low, np.tile(low, history), np.zeros(numbers)]).astype(observations.dtype),
-        np.concatenate([observations.high, np.tile(high, history), np.ones(numbers)]).astype(observations.dtype),
-        dtype=observations.dtype.type,  # type: ignore[arg-type, union-attr]
+        np.concatenate([observations.low, np.tile(low, history), np.zeros(numbers)]).astype(dtype),
+        np.concatenate([observations.high, np.tile(high, history), np.ones(numbers)]).astype(dtype),
+        dtype=dtype.type,
     )
 
 

@@ -1,7 +1,7 @@
 """One episode under a delay: what is on its way, what has arrived, and what is shown. It knows no environment.
 
 At step t the agent has seen s_0 .. s_t as far as they have arrived, and issued u_0 .. u_{t-1}. What is shown makes the
-delayed task Markov again where that is possible (docs/concepts.md says where not): the observation, its age, and the
+delayed task Markov again where that is possible (docs/delays.md says where not): the observation, its age, and the
 actions that may not have acted yet when it was made.
 """
 
@@ -84,6 +84,7 @@ class Transit:
     """The delayed side of one environment.
 
     Attributes:
+        time: steps since the start of the episode.
         over: the episode has ended in truth, and the agent has not been told yet: nothing acts any more.
         random: where travel times are drawn from.
 
@@ -118,7 +119,7 @@ class Transit:
         """
         if seed is not None:
             self.random = np.random.default_rng([seed, 1])
-        self._time = 0
+        self.time = 0
         self._end: int | None = None  # when the agent is told that the episode is over, once it is
         self.over = False
         self._ring[:] = self._idle
@@ -135,7 +136,7 @@ class Transit:
 
     def act(self, action: NDArray[Any]) -> NDArray[Any]:
         """Issue an action; the one that acts now, which is the same array if nothing is late."""
-        applied, now, rows = action, self._time, self._rows
+        applied, now, rows = action, self.time, self._rows
         if self._acting:
             self._lateness = min(now - self._acting.send(now, self.random), self._lag)
             if self._lateness:  # before the first has arrived, the idle action that the ring was filled with
@@ -146,21 +147,18 @@ class Transit:
 
     def step(self, truth: NDArray[Any], reward: float, terminated: bool, truncated: bool) -> tuple[float, bool, bool]:
         """Take in the outcome of a step, or after the end (`over`) the last state again and 0; what arrives of it."""
-        self._time += 1
-        slot = self._time % self._slots
+        self.time += 1
+        slot = self.time % self._slots
         self._states[slot], self._applied[slot] = np.array(truth), self._lateness
-        shown = self._lines.send(self._time, self.random)
-        if shown >= 0:
-            self._shown = shown
-        elif self._fill == "first":
-            self._shown = 0
+        shown = self._lines.send(self.time, self.random)
+        self._shown = shown if shown >= 0 or self._fill == "zeros" else 0
         if self._late_rewards:
             if self._end is None:
-                arrival = self._rewards.send(float(reward), self._time, self.random)
+                arrival = self._rewards.send(float(reward), self.time, self.random)
                 self._end, self.over = (arrival, True) if terminated else (None, False)
-            reward = self._rewards.receive(self._time)
+            reward = self._rewards.receive(self.time)
             # a time limit is the learner's own: it ends the waiting
-            terminated = self._end is not None and (truncated or self._end == self._time)
+            terminated = self._end is not None and (truncated or self._end == self.time)
             if terminated or truncated:
                 reward += self._rewards.flush()
         return reward, terminated, truncated
@@ -172,7 +170,7 @@ class Transit:
             The observation; `age`; the `age` newest actions that were issued, oldest first; and how old the action was
             that led to the observation, whose own age is `age` less the longest action delay.
         """
-        now, shown = self._time, self._shown
+        now, shown = self.time, self._shown
         age = (now - shown if shown >= 0 else now) + self._lag
         first = (now - age) % self._rows
         actions, slot = self._ring[first : first + age], shown % self._slots

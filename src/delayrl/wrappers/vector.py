@@ -38,10 +38,12 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         fill: Fill = "first",
         step_seconds: float | None = None,
     ) -> None:
+        if not isinstance(env, VectorEnv):
+            raise DelayRLError(f"DelayedVector takes a vector of environments; got {type(env).__name__}. See Delayed")
         single.check_spaces(single.name_of(env), env.single_observation_space, env.single_action_space)
         super().__init__(env)
         if step_seconds is None and (envs := getattr(env.unwrapped, "envs", None)):
-            step_seconds = single.step_seconds(envs[0])
+            step_seconds = single.seconds_of(envs[0])
         self.delay = as_delay(delay, step_seconds)
         if self.delay.reward.maximum:
             raise DelayRLError(
