@@ -273,3 +273,22 @@ def test_defaults_are_the_released_codes() -> None:
     assert (DCAC().batch_size, DCAC().learning_rate, DCAC().hidden) == (128, 3e-4, (256, 256))
     assert (DCAC().reward_scale, DCAC().entropy_scale, DCAC().actor_share) == (5.0, 1.0, 0.2)
     assert (DCAC().discount, DCAC().target_rate, DCAC().log_std_range) == (0.99, 5e-3, (-20.0, 2.0))
+
+
+@pytest.mark.parametrize("delay", ["uniform:1:4", "uniform:1:4@raw", "gilbert:1:4:0.3:0.3@fifo"])
+def test_a_stretch_counts_what_arrived_in_it(delay: str) -> None:
+    """Rewards from the first look's state to the last one's, each once, also where a look goes back in time."""
+    replay = store(record("delayrl/Counter-v0", delay, 200)[0], COUNTER)
+    windows = sample(replay, jax.random.key(0), 512, DELAY, DELAY, jnp.int32(0))
+    actor = AGENT.init(COUNTER, jax.random.key(0)).actor
+    keys = jax.random.split(jax.random.key(1), 512)
+    rolls = jax.jit(jax.vmap(AGENT.roll, (None, 0, 0)))(actor, windows, keys)
+    earned = np.cumsum(np.arange(60))  # of the first c steps of an episode: 1 + 2 + … + c
+    moment = np.asarray(windows.obs[:, DELAY, 0]).astype(int)
+    checked = 0
+    for i in np.flatnonzero(~np.asarray(windows.terminated.any(1))):
+        count = int(rolls.steps[i])
+        first, last = (moment[i] + k - int(windows.age[i, DELAY + k]) for k in (0, count))
+        assert float(rolls.reward[i, :count].sum()) == earned[last] - earned[first]
+        checked += count > 1
+    assert checked > 50
