@@ -136,7 +136,7 @@ def test_shipped_grids(name: str) -> None:
 
 def test_grids_of_the_paper() -> None:
     """Its tables' cells, ten seeds, its preset unchanged; runs that tables share are one."""
-    table = load_grid("paper-table1")
+    table = load_grid("paper-table2")
     late = {(c.env, c.delay, c.agent) for c in table.cells if c.delay}
     agents = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
     tasks = {cell.env for cell in table.cells}
@@ -152,12 +152,14 @@ def test_grids_of_the_paper() -> None:
         if cell.agent != "random":
             config, schedule = resolve(cell.agent, cell.preset, cell.protocol, cell.overrides)
             assert (config, schedule) == tuple(AGENTS[cell.agent].presets["paper"])
-    assert load_grid("paper-table2").ids == table.ids
+    first = load_grid("paper-table1")
+    assert first.ids == [cell.id for cell in table.cells if cell.delay in (0, 5)]
+    assert [cell.agent for cell in first.cells[:5]] == ["sac", "random", "vdpo", "bpql", "ad-sac"]
     ablation = load_grid("paper-ablation")
     kinds = [values_of(resolve(c.agent, c.preset, c.protocol, c.overrides)[0]) for c in ablation.cells if c.delay]
     names = [kind["representation"] for kind in kinds]
     assert {name: names.count(name) for name in names} == {"transformer": 9, "transformer-no-belief": 9, "mlp": 9}
-    assert sum(cell.id in table.ids for cell in ablation.cells) == 27  # the anchors, and VDPO itself
+    assert sum(cell.id in first.ids for cell in ablation.cells) == 27  # the anchors, and VDPO itself
 
 
 BAD = [
