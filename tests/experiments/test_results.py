@@ -11,7 +11,7 @@ import delayrl
 from delayrl.cli import main
 from delayrl.experiments import folders
 from delayrl.experiments.grid import Cell, Grid, load_grid
-from delayrl.experiments.results import collect, read_table, rows_of
+from delayrl.experiments.results import collect, read_table, rows_of, versions_of
 from delayrl.experiments.status import standing, status
 from delayrl.experiments.worker import Outcome, work
 from delayrl.runs import Run
@@ -56,9 +56,11 @@ def test_round_trip(finished, tmp_path: Path) -> None:
     assert len(expected) == 2 * 2 * 2
     assert expected[0] | {"cell": grid.cells[0].id} == expected[0]
     assert collect(grid, runs, tmp_path / "mixed.sqlite") == len(expected)
-    rows, cells = read_table(tmp_path / "mixed.sqlite")
+    rows, cells, used = read_table(tmp_path / "mixed.sqlite")
     assert rows == expected
     assert cells == standing(grid.cells, runs)
+    assert used == versions_of(grid.cells, runs)
+    assert used[0]["cores"]
     assert [(p.state, p.step) for _, p in cells] == [("done", 60), ("todo", 0)]
     assert [status(cell, runs) for cell in grid.cells] == ["done", "todo"]
 
@@ -192,7 +194,7 @@ def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("plan nosuch", "unknown grid 'nosuch'; give a .toml file, or one of paper-ablation"),
+        ("plan nosuch", "unknown grid 'nosuch'; give a .toml file, or one of first"),
         ("plan ./nosuch.toml", "there is no grid file nosuch.toml"),
         ("run smoke --cells 123", "has no cell 123"),
         ("run smoke --workers 0", "--workers must be at least 1"),

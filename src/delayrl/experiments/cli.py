@@ -98,20 +98,23 @@ def _collect(grid: Grid, given: argparse.Namespace) -> None:
 
 
 def _report(grid: Grid, given: argparse.Namespace) -> None:
-    from delayrl.experiments.results import rows_of
+    from delayrl.experiments.results import rows_of, versions_of
 
     out = given.out or given.runs / f"{grid.name}-report"
-    _write_report(rows_of(grid.cells, given.runs), standing(grid.cells, given.runs), out, grid.name)
+    rows, used = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
+    _write_report(rows, standing(grid.cells, given.runs), out, grid.name, used)
 
 
 def _report_table(table: Path, given: argparse.Namespace) -> None:
     from delayrl.experiments.results import read_table
 
-    rows, cells = read_table(table)
-    _write_report(rows, cells, given.out or table.with_name(f"{table.stem}-report"), table.stem)
+    rows, cells, used = read_table(table)
+    _write_report(rows, cells, given.out or table.with_name(f"{table.stem}-report"), table.stem, used)
 
 
-def _write_report(rows: Iterable[dict[str, Any]], cells: Standing, out: Path, title: str) -> None:
+def _write_report(
+    rows: Iterable[dict[str, Any]], cells: Standing, out: Path, title: str, versions: list[dict[str, Any]]
+) -> None:
     from delayrl.experiments.report import report
     from delayrl.experiments.summary import Cell as Shown
 
@@ -119,7 +122,7 @@ def _write_report(rows: Iterable[dict[str, Any]], cells: Standing, out: Path, ti
         Shown(c.id, c.agent, c.env, c.delay, c.preset, c.protocol, c.seeds, c.overrides, p.state, p.step, c.steps)
         for c, p in cells
     ]
-    print(f"open {report(rows, shown, out, title)}; the same as Markdown lies beside it")
+    print(f"open {report(rows, shown, out, title, versions)}; the same as Markdown lies beside it")
 
 
 def _run(grid: Grid, given: argparse.Namespace) -> None:

@@ -41,7 +41,13 @@ PAPER = (
 )
 
 
-def report(rows: Iterable[Mapping[str, Any]], cells: Sequence[Cell], out: Path, title: str = "delayrl") -> Path:
+def report(
+    rows: Iterable[Mapping[str, Any]],
+    cells: Sequence[Cell],
+    out: Path,
+    title: str = "delayrl",
+    versions: Sequence[Mapping[str, Any]] = (),
+) -> Path:
     """Write report.md, report.html and img/*.png.
 
     Args:
@@ -49,6 +55,7 @@ def report(rows: Iterable[Mapping[str, Any]], cells: Sequence[Cell], out: Path, 
         cells: of the grid, run or not; empty: inferred from the rows.
         out: the folder.
         title: of the report.
+        versions: with what the rows were made, as in a run's configuration: libraries, commit, hardware.
 
     Returns:
         The HTML page.
@@ -62,7 +69,10 @@ def report(rows: Iterable[Mapping[str, Any]], cells: Sequence[Cell], out: Path, 
     out = Path(out)
     try:
         pictures = figures.draw(summary, out / "img")
-        for name, text in (("report.md", markdown(summary, title, pictures)), ("report.html", page(summary, title))):
+        for name, text in (
+            ("report.md", markdown(summary, title, pictures, versions)),
+            ("report.html", page(summary, title, versions)),
+        ):
             (out / name).write_text(text, encoding="utf-8", errors="replace")
     except OSError as error:
         raise DelayRLError(f"the report cannot be written to {out}: {error.strerror or error}") from error
@@ -122,6 +132,17 @@ def _shared(summary: Summary) -> list[str]:
     return [f"{', '.join(sorted(agents))}: {words}" for words, agents in same.items()]
 
 
+def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line for each machine and set of libraries; commits that differ in nothing else share a line."""
+    commits: dict[str, list[str]] = {}
+    for found in versions:
+        hardware = f"{found.get('device')}, {found.get('cores')} cores, {found.get('machine')}"
+        names = ("python", "jax", "mujoco", "gymnasium")
+        libraries = ", ".join(f"{name} {found[name]}" for name in names if found.get(name))
+        commits.setdefault(f"Made on {hardware}; {libraries}", []).append(str(found.get("commit") or "unknown"))
+    return [f"{words}; commit {', '.join(dict.fromkeys(found))}." for words, found in commits.items()]
+
+
 def _seeds(results: Iterable[Result]) -> str:
     counts = sorted({result.seeds for result in results})
     return _count(counts[0], "seed") if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"
@@ -164,7 +185,9 @@ def _source(summary: Summary, table: Table) -> str:
     return f"Paper: Table{'s' * (len(numbers) > 1)} {', '.join(numbers)}." if numbers else ""
 
 
-def markdown(summary: Summary, title: str, pictures: Mapping[Any, list[str]]) -> str:
+def markdown(
+    summary: Summary, title: str, pictures: Mapping[Any, list[str]], versions: Sequence[Mapping[str, Any]] = ()
+) -> str:
     """The report as Markdown; pictures by setting and kind, as `figures.draw` gives them."""
     parts = [
         f"# {_md(title)}",
@@ -174,6 +197,7 @@ def markdown(summary: Summary, title: str, pictures: Mapping[Any, list[str]]) ->
     if summary.unplaced:
         parts.append(f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out.")
     parts += [f"Overridden in all cells of {_md(line)}." for line in _shared(summary)]
+    parts += [_md(line) for line in made_with(versions)]
     for setting in summary.settings:
         results = [r for r in summary.results.values() if r.place.setting == setting]
         parts.append(f"## Protocol {_md(setting.protocol)}, preset {_md(setting.preset)}, {_seeds(results)}")
@@ -259,7 +283,7 @@ def _anchor(anchor: Anchor) -> dict[str, Any]:
     return {"value": _digits(anchor.value), "runs": anchor.runs, "source": anchor.source}
 
 
-def payload(summary: Summary, title: str) -> dict[str, Any]:
+def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """What the page draws: plain lists and numbers, indices into `settings`, `tasks`, `delays` and `agents`."""
     labels = sorted({*summary.labels, *(c for t in summary.tables for c in t.columns)}, key=agent_order)
     results = list(summary.results.values())
@@ -329,6 +353,7 @@ def payload(summary: Summary, title: str) -> dict[str, Any]:
         "state": _state(summary),
         "counts": Counter(r.status for r in results),
         "notes": [f"Overridden in all cells of {line}." for line in _shared(summary)]
+        + made_with(versions)
         + ([f"{summary.unplaced:,} rows belong to no cell of the grid; left out."] if summary.unplaced else []),
         "paper": PAPER.replace("`", ""),
         "settings": [
@@ -357,12 +382,12 @@ def payload(summary: Summary, title: str) -> dict[str, Any]:
     }
 
 
-def page(summary: Summary, title: str) -> str:
+def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> str:
     """The HTML page: the template with title and data put in, and a policy that allows its own script alone."""
     template = resources.files("delayrl.experiments").joinpath("report.html").read_text("utf-8")
     script = template.split("<script>")[1].split("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    data = json.dumps(payload(summary, title), separators=(",", ":"), allow_nan=False)
+    data = json.dumps(payload(summary, title, versions), separators=(",", ":"), allow_nan=False)
     for sign in "<>&\u2028\u2029":  # none of them can end the data's element, or begin another
         data = data.replace(sign, f"\\u{ord(sign):04x}")
     values = {"title": html.escape(title), "digest": digest, "data": data}

@@ -90,8 +90,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
                 continue
             config = dict(Run(path).config)
             first = config.pop("versions", None)
-            versions = [v for v in ([first] if first else []) + used]
-            distinct = [v for i, v in enumerate(versions) if v not in versions[:i]]
+            distinct = _distinct(([first] if first else []) + used)
             shared = {k: v for k, v in rows[0].items() if k not in OWN and all(row.get(k) == v for row in rows)}
             values = (cell.id, seed, _json(shared), _json(config), _json(distinct))
             run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", values).lastrowid
@@ -108,13 +107,24 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
     return count
 
 
+def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
+    """With what the cells were worked on: versions of libraries, commit, hardware; each once."""
+    paths = [path for cell in cells for path in folders.seed_folders(runs / cell.folder, cell.seeds)]
+    first = [Run(path).config.get("versions") for path in paths if (path / "config.json").exists()]
+    return _distinct([v for v in first if v] + [v for cell in cells for v in _versions(runs / cell.folder)])
+
+
+def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [value for i, value in enumerate(values) if value not in values[:i]]
+
+
 def _versions(folder: Path) -> list[dict[str, Any]]:
     """With what a cell was worked on: more than one where it went on elsewhere, or after an update."""
     return [event["versions"] for event in folders.journal(folder) if "versions" in event]
 
 
-def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]]]:
-    """Rows of a collected table, and its cells with how far they were.
+def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list[dict[str, Any]]]:
+    """Rows of a collected table, its cells with how far they were, and with what they were worked on.
 
     Raises:
         DelayRLError: no table of ours, or of another schema version.
@@ -135,7 +145,8 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]]]:
             shared[run] | dict(zip(OWN, values, strict=True)) | (json.loads(more) if more else {})
             for run, more, *values in table.execute(f"SELECT run, more, {columns} FROM rows")
         ]
-    return rows, cells
+        used = [version for (text,) in table.execute("SELECT versions FROM runs") for version in json.loads(text)]
+    return rows, cells, _distinct(used)
 
 
 @contextlib.contextmanager
