@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.special import erf
 
 from delayrl import networks
-from delayrl.transformer import dropout, transformer, transformer_init
+from delayrl.transformer import dropout, dropout_masks, transformer, transformer_init
 
 SIZES = {"obs_size": 5, "action_size": 3, "length": 6, "width": 16, "layers": 3}
 
@@ -84,9 +84,15 @@ def test_dropout_is_off_without_key(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("rate", [0.1, 0.5])
 def test_dropout_keeps_the_mean(rate: float) -> None:
-    x = dropout(jax.random.key(0), rate, jnp.ones((1000, 1000)))
-    assert abs(float((x == 0).mean()) - rate) < 0.002
-    assert abs(float(x.mean()) - 1) < 0.005
+    """In every mask; and two masks of one draw have nothing to do with each other."""
+    one, other = dropout_masks(jax.random.key(0), rate, [(1000, 1001), (1001, 1000)])
+    for kept in (one, other):
+        x = dropout(kept, rate, jnp.ones(kept.shape))
+        assert abs(float((x == 0).mean()) - rate) < 0.002
+        assert abs(float(x.mean()) - 1) < 0.005
+    a, b = np.asarray(one, float).ravel(), np.asarray(other, float).ravel()
+    for first, second in [(a, b), (a[1:], a[:-1]), (a[1000:], a[:-1000]), (a[500_500:], a[:500_500])]:
+        assert abs(np.corrcoef(first, second)[0, 1]) < 0.005
 
 
 @pytest.mark.parametrize("log_std", [-5.0, 0.0, 2.0])

@@ -83,6 +83,8 @@ class Program:
         agent, replay = learner
         if transition is not None:
             replay = jax.vmap(functools.partial(ring.append, whole=self._whole))(replay, transition)
+            # else the write is fused into the gathers of `sample`, and the whole replay is copied at every step
+            replay = jax.lax.optimization_barrier(replay)
         if index is None:
             return Learner(agent, replay), {}
         phase = self.phases[index]

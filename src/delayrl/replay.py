@@ -55,7 +55,7 @@ def append(replay: Replay, step: Transition, whole: int = 1) -> Replay:
     capacity = replay.obs.shape[0]
     here, after = replay.rows % capacity, (replay.rows + 1) % capacity
     rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps its last observation's row
-    moment = replay.moment[here] + 1
+    moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before it is written, or all is copied
     row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (whole - 1))
     steps, lost = replay.steps + (moment >= whole), replay.lost
     for _ in range(2):  # at most two rows are overwritten

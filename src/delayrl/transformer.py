@@ -1,8 +1,13 @@
 """The causal transformer of VDPO, as pure functions on plain trees of arrays."""
 
+import itertools
+import math
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.extend.random import threefry_2x32
+from jaxtyping import Array, Bool, Float
 
 from delayrl.networks import Params, cut, linear, uniform
 from delayrl.types import Key
@@ -14,11 +19,21 @@ def layer_norm(params: Params, x: Float[Array, "*batch width"]) -> Float[Array, 
     return centred * jax.lax.rsqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * params["scale"] + params["shift"]
 
 
-def dropout(key: Key | None, rate: float, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Zero a share `rate` of the entries and scale up the rest; without a key, nothing."""
-    if key is None or rate == 0:
-        return x
-    return jnp.where(jax.random.bernoulli(key, 1 - rate, x.shape), x / (1 - rate), 0)
+def dropout(kept: Bool[Array, "*shape"] | None, rate: float, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Zero the entries that are not kept and scale up the rest; without a mask, nothing."""
+    return x if kept is None else jnp.where(kept, x * (1 / (1 - rate)), 0)
+
+
+def dropout_masks(key: Key, rate: float, shapes: Sequence[tuple[int, ...]]) -> list[Bool[Array, "..."]]:
+    """What dropout keeps, for all layers from one draw: 16 random bits an entry, the rate to within 2⁻¹⁷.
+
+    Four times cheaper than a `jax.random.bernoulli` for each layer, which spends 64 bits of Threefry on an entry.
+    """
+    sizes = [math.prod(shape) for shape in shapes]
+    counter = jnp.arange(2 * -(-sum(sizes) // 4), dtype=jnp.uint32)
+    bits = jax.lax.bitcast_convert_type(threefry_2x32(jax.random.key_data(key), counter), jnp.uint16).reshape(-1)
+    pieces = jnp.split((bits >= round(rate * 2**16))[: sum(sizes)], list(itertools.accumulate(sizes))[:-1])
+    return [piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
 def transformer_init(key: Key, obs_size: int, action_size: int, length: int, width: int, layers: int) -> Params:
@@ -76,23 +91,21 @@ def transformer(
         key: for dropout; None switches it off.
     """
     length, width = params["position"].shape
-    keys = iter(
-        [None] * (1 + 3 * len(params["blocks"]))
-        if key is None
-        else jax.random.split(key, 1 + 3 * len(params["blocks"]))
-    )
+    stream, square = (*obs.shape[:-1], length, width), (*obs.shape[:-1], length, length)
+    shapes = [stream, *[square, stream, stream] * len(params["blocks"])]
+    masks = iter(dropout_masks(key, rate, shapes) if key is not None and rate > 0 else [None] * len(shapes))
     # join([e_obs, e_action]) as two products: the observation's half is the same for every token
     w_obs, w_action = jnp.split(params["join"]["w"], 2)
     from_obs = linear(params["obs"], obs) @ w_obs + params["join"]["b"]
     x = from_obs[..., None, :] + linear(params["action"], actions) @ w_action + params["position"]
-    x = dropout(next(keys), rate, layer_norm(params["norm_in"], x))
+    x = dropout(next(masks), rate, layer_norm(params["norm_in"], x))
     causal = jnp.tril(jnp.ones((length, length), bool))
     for block in params["blocks"]:
         x = layer_norm(block["norm1"], x)
         query, keyed, value = jnp.split(linear(block["qkv"], x), 3, -1)
         scores = jnp.einsum("...td,...sd->...ts", query, keyed) * width**-0.5
-        attention = dropout(next(keys), rate, jax.nn.softmax(jnp.where(causal, scores, -jnp.inf)))
-        x = x + dropout(next(keys), rate, linear(block["out"], jnp.einsum("...ts,...sd->...td", attention, value)))
+        attention = dropout(next(masks), rate, jax.nn.softmax(jnp.where(causal, scores, -jnp.inf)))
+        x = x + dropout(next(masks), rate, linear(block["out"], jnp.einsum("...ts,...sd->...td", attention, value)))
         hidden = jax.nn.gelu(linear(block["mlp"][0], layer_norm(block["norm2"], x)), approximate=False)
-        x = x + dropout(next(keys), rate, linear(block["mlp"][1], hidden))
+        x = x + dropout(next(masks), rate, linear(block["mlp"][1], hidden))
     return layer_norm(params["norm_out"], x)
