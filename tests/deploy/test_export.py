@@ -163,6 +163,15 @@ def test_latency(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "onnx" not in text
 
 
+@pytest.mark.parametrize("name", ["safetensors", "numpy", "json"])
+def test_a_module_beside_the_bundle_is_not_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = bundle_of(tmp_path / "bundle", policy_of("bpql"))
+    (out / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
+    monkeypatch.chdir(out)
+    assert latency(".", "numpy", decisions=1)
+    assert not (tmp_path / "executed").exists()
+
+
 def test_latency_refuses(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bundle"
     export_run(run, out)

@@ -134,7 +134,7 @@ def _parsed(data: bytes, file: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or "format" not in document:
         raise DelayRLError(f"{file} is damaged, or of another program: it has no format")
     if type(document["format"]) is not int or document["format"] != FORMAT:
-        raise DelayRLError(f"{file} has format {str(document['format'])[:20]}; this version reads {FORMAT}")
+        raise DelayRLError(f"{file} has format {document['format']!r:.40}; this version reads {FORMAT}")
     try:
         same = document.get("checksum") == checksum(document)
     except (ValueError, RecursionError):  # e.g. half of a surrogate pair
@@ -181,7 +181,7 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     try:
         return safetensors.numpy.load(data)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError, OverflowError, MemoryError) as error:
-        raise DelayRLError(f"it is no safetensors file that we write ({str(error).splitlines()[0][:80]})") from error
+        raise DelayRLError(f"it is no safetensors file that we write ({str(error)[:80]!r})") from error
 
 
 def _digest(data: bytes) -> str:

@@ -135,5 +135,5 @@ def _one_line(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # of the network, of its client, of its client's client: all end here
-        line = (str(error).strip().splitlines() or [""])[0].strip()
+        line = "".join(filter(str.isprintable, (str(error).strip().splitlines() or [""])[0]))
         raise DelayRLError(f"{what}: {line[:200] or type(error).__name__}") from error
