@@ -10,7 +10,8 @@ class Statistics:
 
     `age_*`, `delay_*` and `period_*` leave the cold start out: a decision counts from the first one of its episode on
     whose observation was made after the first command. Before, the age only shows how long the episode has run. Ages of
-    decisions that `on_overrun="raise"` refused are not in; `overruns` counts these. They are NaN while nothing has been counted (`age_max`: 0); `delay_*` and `period_*` also with stamps in steps.
+    decisions that `on_overrun="raise"` refused are not in; `overruns` counts these. They are NaN while nothing has been
+    counted (`age_max`: 0); `delay_*` and `period_*` also with stamps in steps.
 
     Attributes:
         decisions: actions chosen by `act`.
