@@ -13,6 +13,7 @@ import delayrl
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
 from delayrl.config import override, values_of
+from delayrl.delays import as_delay
 from delayrl.envs import make
 from delayrl.evaluation import evaluate
 from delayrl.runs import Run
@@ -371,7 +372,8 @@ def test_options_round_trip() -> None:
 @pytest.mark.parametrize("agent", list(AGENTS))
 def test_unprivileged_agents_are_not_given_the_truth(agent: str) -> None:
     preset = AGENTS[agent].presets["small"]
-    session = Session(preset.agent, preset.schedule, "Reacher-v5", 0 if agent == "sac" else 3, [0])
+    delay = as_delay(0 if agent == "sac" else 3)
+    session = Session(preset.agent, preset.schedule, "Reacher-v5", delay, [0])
     actor = session.actors[0]
     actor.reset()
     for _ in range(5):

@@ -270,15 +270,19 @@ class Policy {
         const Json& described = bundle.at("policy");
         obs_size = described.at("obs_size").whole(1, 1e6);
         action_size = described.at("action_size").whole(1, 1e6);
-        max_age = described.at("max_age").whole(0, 1e6);
-        for (const Json& bound : described.at("low").items) low_.push_back(static_cast<float>(bound.value));
-        for (const Json& bound : described.at("high").items) high_.push_back(static_cast<float>(bound.value));
+        max_age = described.at("max_age").whole(0, 1e4);
+        if (max_age * action_size > 10000000) refuse("the action history is too large");
+        low_ = numbers(described.at("low"));
+        high_ = numbers(described.at("high"));
         if (low_.size() != action_size || high_.size() != action_size) refuse("low and high are not as long as an action");
+        for (std::size_t j = 0; j < action_size; ++j)
+            if (!(low_[j] < high_[j]) || !std::isfinite(high_[j] - low_[j])) refuse("low must lie below high, both finite");
         input_ = described.at("input").string;
         const std::size_t width = described.at("width").whole(0, 1e6), blocks = described.at("blocks").whole(0, 1000);
 
         const Weights weights(folder + "/policy.safetensors");
         std::size_t read = obs_size;
+        if (input_ != "observation" && max_age == 0) refuse("the policy's input needs an age");
         if (input_ == "augmented")
             read += max_age * action_size + 1;
         else if (input_ == "transformer")
@@ -288,6 +292,8 @@ class Policy {
         head_ = network(weights, "head", read, described.at("hidden"));
         if (described.at("current").kind == Json::list)
             current_ = network(weights, "current", obs_size, described.at("current"));
+        if (input_ == "transformer" && (current_.empty() || width == 0))
+            refuse("a transformer needs a width, and a network for age 0");
         if (input_ == "transformer") encoder(weights, width, blocks);
     }
 
@@ -331,6 +337,15 @@ class Policy {
     Layer of_obs_, of_action_, join_obs_, join_action_;
     Norm norm_in_, norm_out_;
     std::vector<Block> blocks_;
+
+    static Floats numbers(const Json& list) {
+        Floats found;
+        for (const Json& item : list.items) {
+            if (item.kind != Json::number) refuse("low and high must be numbers");
+            found.push_back(static_cast<float>(item.value));
+        }
+        return found;
+    }
 
     static Layer layer(const Weights& weights, const std::string& name, std::size_t inputs, std::size_t outputs) {
         return {inputs, outputs, weights.take(name + ".w", {inputs, outputs}), weights.take(name + ".b", {outputs})};
@@ -430,12 +445,14 @@ void serve(const Policy& policy) {
     std::string line;
     while (std::getline(std::cin, line)) {
         std::istringstream words(line);
-        long age = -1;
+        double age = -1;
         Floats obs(policy.obs_size), actions(policy.max_age * policy.action_size);
         words >> age;
         for (float& value : obs) words >> value;
         for (float& value : actions) words >> value;
-        if (!words || age < 0) refuse("a line needs an age, an observation and an action history");
+        std::string rest;
+        if (!words || !(age >= 0 && age <= static_cast<double>(policy.max_age)) || age != std::floor(age) || words >> rest)
+            refuse("a line needs an age, an observation and an action history, and nothing else");
         const Floats action = policy.act(obs, actions, static_cast<std::size_t>(age));
         for (std::size_t j = 0; j < action.size(); ++j) std::printf(j ? " %.9g" : "%.9g", action[j]);
         std::printf("\n");

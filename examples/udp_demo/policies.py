@@ -20,13 +20,14 @@ class RunPolicy:
         import delayrl
         from delayrl.envs import make
         from delayrl.runs import Run
+        from delayrl.wrappers.single import seconds_of
 
         self._policy = delayrl.load(path)
         spec = self._policy.spec
         self.obs_size, self.action_size, self.max_age = spec.obs_size, spec.action_size, spec.delay
         self.low, self.high = self._policy.low, self._policy.high
         env = make(Run(path).config["env"])
-        self.dt: float | None = getattr(env.unwrapped, "dt", None)
+        self.dt = seconds_of(env)
         env.close()
 
     def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:

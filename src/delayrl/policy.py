@@ -12,7 +12,7 @@ from delayrl.agents.base import Agent, State, template
 from delayrl.config import check_names, override
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
-from delayrl.runs import Run, restore_tree
+from delayrl.runs import Checkpoint, Run, restore_tree
 from delayrl.types import Spec
 from delayrl.views import seen_now
 
@@ -66,7 +66,11 @@ def load(path: str | Path) -> Policy:
     """
     run = Run(Path(path))
     config = run.config
-    checkpoint = run.latest()
+    return restored(config, run.latest())
+
+
+def restored(config: dict[str, Any], checkpoint: Checkpoint) -> Policy:
+    """The policy in a checkpoint of a run with this configuration."""
     agent = agent_of(config)
     env = make(config["env"], config["delay"])
     spec = spec_of(env)

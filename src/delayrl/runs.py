@@ -103,10 +103,10 @@ class Run:
     def read(self, name: str) -> list[dict[str, Any]]:
         """The lines of rows.jsonl or metrics.jsonl; a last line that a crash cut off is left out."""
         file = self.path / f"{name}.jsonl"
-        lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
         try:
+            lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
             return [json.loads(line) for line in lines if line.endswith("\n")]
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DelayRLError(f"{file} is damaged: {error}") from error
 
     def rewind(self, step: int) -> None:

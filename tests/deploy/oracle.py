@@ -18,6 +18,11 @@ DT = 1 / 16
 Event = tuple[str, int, int]
 
 
+def nearest(x: float) -> int:
+    """The whole number that is nearest; halfway the larger."""
+    return min(range(int(x) - 1, int(x) + 2), key=lambda m: (abs(x - m), -m))
+
+
 @dataclass(frozen=True)
 class Setting:
     """Of a controller, in numbers."""
@@ -57,7 +62,7 @@ class Oracle:
 
     setting: Setting
     episode: int = 0
-    start: float = -math.inf
+    start: float | None = 0.0  # None while the first observation or command is to say it
     # ("obs", stamp, content) | ("command", now, action) | ("fix", step, action), as far as they were accepted
     log: list[tuple[str, float, float]] = field(default_factory=list)
     tally: dict[str, int] = field(default_factory=dict)
@@ -66,6 +71,13 @@ class Oracle:
     periods: list[float] = field(default_factory=list)
     missed: int = 0
     replaced: int = 0
+
+    def __post_init__(self) -> None:
+        self.start = None if self.setting.seconds else 0.0
+
+    def before(self, when: float) -> int:
+        """Whole steps from the start of the episode to a time."""
+        return 0 if self.start is None else max(0, nearest((when - self.start) / self.setting.period))
 
     def count(self, name: str) -> None:
         self.tally[name] = self.tally.get(name, 0) + 1
@@ -83,14 +95,13 @@ class Oracle:
                 continue
             begin = when + s.action_delay * s.period
             if not begins:
-                quiet = s.action_delay + (0 if s.seconds else int(when))
-                missed += quiet - s.action_delay
+                missed += self.before(when)
+                quiet = s.action_delay + self.before(when)
                 for i in range(quiet):
                     begins.append(begin - (quiet - i) * s.period)
                     actions.append(0.0 if s.idle is None else s.idle)
             else:
-                gap = (begin - begins[-1]) / s.period
-                whole = min(range(int(gap), int(gap) + 2), key=lambda m: (abs(gap - m), -m))
+                whole = nearest((begin - begins[-1]) / s.period)
                 if whole == 0:
                     replaced += 1
                     if action is None:
@@ -117,9 +128,9 @@ class Oracle:
 
     def observe(self, content: float, stamp: float, now: float, episode: int | None) -> str:
         seen = self.observations()
-        if not math.isfinite(content) or not math.isfinite(stamp) or (stamp < 0 and not self.setting.seconds):
+        if not abs(content) <= 3.4e38 or not abs(stamp) <= 1e15 or (stamp < 0 and not self.setting.seconds):
             verdict = "invalid"
-        elif (episode is not None and episode != self.episode) or stamp < self.start:
+        elif (episode is not None and episode != self.episode) or (self.start is not None and stamp < self.start):
             verdict = "late"
         elif stamp - now > self.setting.period / 2:
             verdict = "future"
@@ -130,11 +141,12 @@ class Oracle:
         else:
             verdict = "new"
             self.log.append(("obs", stamp, content))
+            self.start = stamp if self.start is None else self.start
         self.count(verdict)
         return verdict
 
     def forward(self, now: float) -> None:
-        if not math.isfinite(now) or (now < 0 and not self.setting.seconds) or any(c >= now for c in self.commands()):
+        if not abs(now) <= 1e15 or (now < 0 and not self.setting.seconds) or any(c >= now for c in self.commands()):
             raise ClockError
 
     def act(self, now: float) -> tuple[int, float, list[float], list[float]]:
@@ -153,14 +165,15 @@ class Oracle:
             self.count("overruns")
             if self.setting.on_overrun == "raise":
                 raise OverrunError
-        if step > 0:
+        if self.commands() and step > self.before(self.commands()[0]):
             self.ages.append(age)
             self.delays.append(now - stamp)
-            self.periods += [now - max(self.commands(), default=math.nan)]
+            self.periods += [now - max(self.commands())]
         return age, content, actions[step:], self.steps()[1]
 
     def command(self, now: float, action: float) -> None:
         self.log.append(("command", now, action))
+        self.start = now if self.start is None else self.start
 
     def applied(self, step: int, action: float) -> None:
         if not 0 <= step < len(self.steps()[1]):
@@ -170,7 +183,7 @@ class Oracle:
     def reset(self, now: float) -> None:
         *_, missed, replaced = self.steps()
         self.missed, self.replaced = self.missed + missed, self.replaced + replaced
-        self.episode, self.start, self.log = self.episode + 1, now if self.setting.seconds else -math.inf, []
+        self.episode, self.start, self.log = self.episode + 1, now if self.setting.seconds else 0.0, []
 
 
 def play(setting: Setting, events: list[Event]) -> dict[str, int]:
@@ -210,6 +223,8 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
         default = world if setting.seconds else oracle.elapsed()
         now = world if explicit else default
         argument = world if explicit else None
+        if kind in ("act", "override") and y == 2:
+            now = argument = [1e16, -1e308, 10**400, math.nan][number % 4]
         value = 1000.0 + number
         if kind == "wait":
             world += x * unit
@@ -219,9 +234,9 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
                 case 1 if sent:  # again, or at last: whatever was made before
                     stamp, content = sent[x % len(sent)]
                 case 2:
-                    content = [math.nan, math.inf, -math.inf][x % 3]
+                    content = [math.nan, math.inf, -math.inf, 1e39, -1e300][x % 5]
                 case 3:
-                    stamp = [math.nan, math.inf, -math.inf][x % 3]
+                    stamp = [math.nan, math.inf, -math.inf, 1e16, -1e308, 10**400][x % 6]
                 case 4:
                     episode = oracle.episode - x % 2
                 case _:
@@ -338,9 +353,9 @@ def draw_events(rng: np.random.Generator, setting: Setting, length: int) -> list
             case 4 if a % 20 == 0:
                 events.append(("wait", (b % 300) * ticks, 0))
             case 5 | 6:
-                events.append(("act", 0, b % 2))
+                events.append(("act", 0, b % 3))
             case 7 | 8:
-                events.append(("override", 0, b % 2))
+                events.append(("override", 0, b % 3))
             case 9 | 10:
                 events.append(("applied", a % 6 - 1, 0))
             case 11:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from delayrl.cli import main
 from delayrl.deploy import load_bundle
 from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, seal
+from delayrl.deploy.network import parse
 from delayrl.errors import DelayRLError
 
 
@@ -71,6 +72,10 @@ def test_whole_bundles_load(bundle: Path) -> None:
         (np.full(10, np.nan), np.zeros((4, 2)), 0, "not a finite number"),
         (np.full(10, np.inf), np.zeros((4, 2)), 3, "not a finite number"),
         (np.zeros(10), np.full((4, 2), np.nan), 1, "not a finite number"),
+        (np.full(10, 1e39), np.zeros((4, 2)), 0, "not a finite number"),
+        ("abcd", np.zeros((4, 2)), 0, "arrays of numbers"),
+        (np.zeros(10), [[1.0], [1.0, 2.0]], 0, "arrays of numbers"),
+        ([10**400] * 10, np.zeros((4, 2)), 0, "arrays of numbers"),
         (np.full(10, 3e38), np.zeros((4, 2)), 2, "so large"),
     ],
 )
@@ -103,12 +108,13 @@ def test_no_bundle(tmp_path: Path, original: Path) -> None:
         (b"{}", "no format"),
         (b'{"format": 2}', "format 2; this version reads 1"),
         (b'{"format": true}', "format True; this version reads 1"),
-        (b'{"format": "1"}', "format 1; this version reads 1"),
+        (b'{"format": "1"}', "format '1'; this version reads 1"),
+        (b'{"format": "x\\ny\\u001b[31m"}', r"format 'x\ny\x1b[31m'; this"),
         (b'{"format": 1}', "checksum"),
         (b'{"format": 1, "checksum": "\\ud800"}', "checksum"),
         (b" " * (1 << 20) + b"{}", "larger than"),
     ],
-    ids=range(16),
+    ids=range(17),
 )
 def test_broken_documents(bundle: Path, content: bytes, words: str) -> None:
     (bundle / DOCUMENT).write_bytes(content)
@@ -130,7 +136,7 @@ BAD_POLICIES: list[tuple[str, Any]] = [
     *(("high", value) for value in ([0.4], [-0.4, 3.0], None)),
     *(("input", value) for value in ("observation", "augmented", "pickle", None, ["transformer"])),
     *(("hidden", value) for value in ([], [16], [0, 16], [16] * 1000, None, [10**6, 10**6])),
-    *(("current", value) for value in (None, [], 3)),
+    *(("current", value) for value in (None, [], 3)),  # below: also where the weights would fit
     *(("width", value) for value in (0, 9, 10**6)),
     *(("blocks", value) for value in (0, 1, 3, 1000, 10**6)),
 ]
@@ -141,6 +147,27 @@ def test_policies_that_are_not_the_weights(bundle: Path, name: str, value: Any) 
     """A well-made bundle whose description does not fit: told apart before anything large is allocated."""
     forge(bundle, lambda document: document["policy"].update({name: value}))
     refused(bundle, "")
+
+
+def test_a_transformer_needs_a_network_for_age_0(bundle: Path) -> None:
+    arrays = safetensors.numpy.load((bundle / WEIGHTS).read_bytes())
+    rest = {name: array for name, array in arrays.items() if not name.startswith("current.")}
+    forge(bundle, lambda document: document["policy"].update(current=None), weights=safetensors.numpy.save(rest))
+    refused(bundle, "needs a current")
+
+
+@pytest.mark.parametrize(("max_age", "action_size"), [(10_001, 1), (10_000, 1001)])
+def test_a_small_file_cannot_ask_for_much_memory(max_age: int, action_size: int) -> None:
+    """An observation's policy has the same weights at any max_age."""
+
+    def document(max_age: int) -> dict[str, Any]:
+        low, high = ([value] * action_size for value in (-1.0, 1.0))
+        sizes = {"obs_size": 1, "action_size": action_size, "max_age": max_age, "width": 0, "blocks": 0}
+        return {**sizes, "low": low, "high": high, "input": "observation", "hidden": [2], "current": None}
+
+    parse(document(9_000))
+    with pytest.raises(DelayRLError, match="history too large"):
+        parse(document(max_age))
 
 
 @pytest.mark.parametrize(

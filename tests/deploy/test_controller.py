@@ -61,8 +61,8 @@ SETTINGS = st.builds(
 EVENTS = st.one_of(
     st.tuples(st.just("wait"), st.integers(-4, 24), st.just(0)),
     st.tuples(st.just("observe"), st.integers(-8, 24), st.integers(0, 9)),
-    st.tuples(st.just("act"), st.just(0), st.integers(0, 1)),
-    st.tuples(st.just("override"), st.just(0), st.integers(0, 1)),
+    st.tuples(st.just("act"), st.just(0), st.integers(0, 2)),
+    st.tuples(st.just("override"), st.just(0), st.integers(0, 2)),
     st.tuples(st.just("applied"), st.integers(-1, 5), st.just(0)),
     st.tuples(st.just("reset"), st.just(0), st.integers(0, 1)),
 )
@@ -89,13 +89,18 @@ class Recorder:
 
 
 @pytest.mark.parametrize("stamps", ["steps", "seconds"])
+@pytest.mark.parametrize("late", [0, 3])
 @pytest.mark.parametrize("delay", ["0", "1", "5", "uniform:0:4", "gilbert:1:5:0.2:0.4@fifo", "uniform:0:3+action=2"])
-def test_shows_what_the_wrapper_shows(stamps: str, delay: str) -> None:
-    """The wrapper's shown observation goes through the network: here, one that brings all of them at random."""
+def test_shows_what_the_wrapper_shows(stamps: str, delay: str, late: int) -> None:
+    """The wrapper's shown observation goes through the network: here, one that brings all of them at random.
+
+    The first ones `late` steps late: nobody can act before, and the plant does what it does by itself.
+    """
     env = Delayed(gym.make("Pendulum-v1"), delay)
     policy = Recorder(env, env.history, dt=0.05)
     lag = env.delay.action.maximum
-    uneven = 0.04 if lag else 0.2  # the control period; actions in flight take so many nominal ones
+    # the control period; actions in flight and steps without a command take so many nominal ones
+    uneven = 0.04 if lag or late else 0.2
     controller = Controller(policy, stamps=stamps, action_delay=lag, on_overrun="raise")
     rng = np.random.default_rng(0)
     clock = 100.0
@@ -108,12 +113,16 @@ def test_shows_what_the_wrapper_shows(stamps: str, delay: str) -> None:
             clock += 0.05 * rng.uniform(1 - uneven, 1 + uneven)
             times.append(clock)
             mailbox[step] = info["truth"]
+            if step < late:
+                obs, _, _, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
+                continue
+            now = clock if stamps == "seconds" else step
             shown = step - info["age"] + lag
             for k in rng.permutation([k for k in mailbox if k <= shown][-3:]):  # in any order, and again and again
                 stamp = times[k] - 0.015 * rng.random() if stamps == "seconds" else int(k)
                 if stamps == "steps" or k == shown:
-                    controller.observe(mailbox[k], stamp, clock if stamps == "seconds" else None)
-            action = controller.act(clock if stamps == "seconds" else None)
+                    controller.observe(mailbox[k], stamp, now)
+            action = controller.act(now)
             got_obs, got_actions, got_age = policy.shown[-1]
             np.testing.assert_array_equal(got_obs, obs)
             np.testing.assert_array_equal(got_actions, info["actions"])
@@ -176,6 +185,73 @@ def test_the_cold_start_is_not_in_the_effective_delay() -> None:
         controller.act()
     got = controller.statistics
     assert (got.age_mean, got.age_std, got.age_max, got.counted) == (5, 0, 5, 24)
+
+
+@pytest.mark.parametrize(("stamps", "dt"), [("steps", 1.0), ("seconds", 0.25)])
+@pytest.mark.parametrize("announced", [True, False])
+def test_a_first_observation_that_comes_late_is_as_old_as_it_is(stamps: str, dt: float, announced: bool) -> None:
+    """By the wrapper's count, s_0 has the age 5 at step 5; the plant was idle meanwhile. Both modes say the same."""
+    policy = counting(8)
+    controller = Controller(policy, stamps=stamps, idle=[7.0], **({} if stamps == "steps" else {"dt": dt}))
+    if announced:
+        controller.reset(0.0)
+    assert controller.observe([1.0], 0.0, now=5 * dt) == "new"
+    controller.act(5 * dt)
+    controller.act(6 * dt)
+    assert policy.calls[1:] == [(1.0, [7] * 5 + [0] * 3, 5), (1.0, [7] * 5 + [2, 0, 0], 6)]
+    controller.observe([2.0], 5 * dt, now=7 * dt)
+    controller.act(7 * dt)
+    assert controller.statistics.counted == 0  # made before anybody had acted
+    controller.observe([3.0], 6 * dt, now=8 * dt)
+    controller.act(8 * dt)
+    assert (controller.statistics.counted, controller.statistics.age_mean) == (1, 2)
+    assert controller.statistics.missed == 5
+
+
+def test_an_old_first_observation_is_an_overrun() -> None:
+    controller = Controller(counting(), stamps="seconds", dt=0.25, on_overrun="raise")
+    controller.observe([1.0], 0.0, now=100.0)
+    with pytest.raises(OverrunError, match="400 steps old"):
+        controller.act(100.0)
+    controller.override([0.0], 100.0)
+    assert controller.statistics.overruns == 1
+    other = Controller(counting(), stamps="seconds", dt=0.25)
+    other.override([0.0], 100.0)  # the episode begins with this command: what is older is not of it
+    assert other.observe([1.0], 0.0, now=100.1) == "late"
+
+
+def test_in_steps_a_lost_first_observation_needs_now() -> None:
+    controller = Controller(counting())
+    assert controller.observe([1.0], 1) == "future"
+    assert controller.observe([1.0], 1, now=2) == "new"
+    controller.act(2)
+    assert controller.policy.calls[-1] == (1.0, [0, 0, 0], 1)
+
+
+def test_what_single_precision_does_not_hold_is_not_used() -> None:
+    controller = Controller(counting())
+    controller.observe([1.0], 0)
+    assert controller.observe([1e39], 1, now=1) == "invalid"
+    controller.act(1)
+    assert controller.policy.calls[-1][0] == 1.0
+
+
+@pytest.mark.parametrize("huge", [1e16, 1e308, -1e308, 10**400, -(10**400)])
+def test_times_beyond_reach(huge: float) -> None:
+    controller = Controller(counting(), stamps="seconds", dt=0.25)
+    assert controller.observe([1.0], huge, now=0.0) == "invalid"
+    controller.observe([1.0], 0.0, now=0.0)
+    for call in (controller.act, controller.reset, lambda now: controller.observe([1.0], 0.0, now)):
+        with pytest.raises(ClockError):
+            call(huge)
+    controller.act(1e15)
+
+
+def test_the_policys_own_action_delay() -> None:
+    policy = counting()
+    policy.action_delay = 2
+    assert Controller(policy).action_delay == 2
+    assert Controller(policy, action_delay=0).action_delay == 0
 
 
 def test_an_observation_pushed_twice_is_one() -> None:
@@ -284,6 +360,10 @@ def test_episodes_do_not_mix() -> None:
         (lambda c: c.act(-1), "steps count from 0"),
         (lambda c: c.override([math.nan]), "1 finite numbers"),
         (lambda c: c.applied([1.0]), "0 steps"),
+        (lambda c: c.applied([1.0], 0.0), "whole number; got 0.0"),
+        (lambda c: c.applied([1.0], "a"), "whole number; got 'a'"),
+        (lambda c: c.observe([10**400], 0), "array of numbers"),
+        (lambda c: c.override([1e39]), "1 finite numbers"),
     ],
 )
 def test_mistakes_are_one_line_and_change_nothing(call, message: str) -> None:
@@ -304,7 +384,7 @@ def test_mistakes_are_one_line_and_change_nothing(call, message: str) -> None:
         ({"action_delay": -1}, "whole steps"),
         ({"action_delay": 4}, "longest age, 3"),
         ({"dt": 0.1}, "steps have no length"),
-        ({"stamps": "seconds", "dt": 0.0}, "give dt"),
+        *(({"stamps": "seconds", "dt": dt}, "give dt") for dt in (0.0, "0.1", True, 1e-300, 1e7, math.nan)),
         ({"idle": [1.0, 2.0]}, "idle must be 1 finite"),
     ],
 )
@@ -335,7 +415,7 @@ def test_an_observation_older_than_the_memory(on_overrun: str) -> None:
     controller.observe([1.0], 90.0, 90.0)  # 40 periods before the first command
     for i in range(300):
         action = controller.act(100 + 0.25 * i)
-    assert controller.statistics.overruns == 297
+    assert controller.statistics.overruns == 300
     assert controller.statistics.counted == 0  # nothing newer than step 0 has arrived
     controller.observe([1.0], 101.0, 180.0)
     assert controller.act(100 + 0.25 * 300) == action

@@ -9,9 +9,11 @@ from bundles import bundle_of, policy_of, run_of
 
 from delayrl import load, make
 from delayrl.cli import main
-from delayrl.deploy import export_run, load_bundle
+from delayrl.deploy import Controller, export_run, load_bundle
 from delayrl.deploy.latency import ages_of, latency
+from delayrl.envs import tasks
 from delayrl.errors import DelayRLError
+from delayrl.runs import Checkpoint, Run
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +101,52 @@ def test_a_task_that_does_not_say_its_step(tmp_path: Path) -> None:
     assert load_bundle(tmp_path / "bundle").dt is None
 
 
+def test_a_task_that_says_its_step_by_another_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(make("delayrl/Counter-v0").unwrapped), "tau", 0.04, raising=False)
+    run = run_of(tmp_path / "run", "a-sac", "delayrl/Counter-v0", 2, (2, 1))
+    assert export_run(run.path, tmp_path / "bundle")["dt"] == 0.04
+    assert next(task.seconds for task in tasks() if task.name == "delayrl/Counter-v0") == 0.04
+
+
+def test_the_delay_of_actions_comes_along(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "run", "a-sac", "delayrl/Counter-v0", 3, (2, 1))
+    config = json.loads((run.path / "config.json").read_text())
+    (run.path / "config.json").write_text(json.dumps(config | {"delay": "1+action=2"}))
+    export_run(run.path, tmp_path / "bundle")
+    policy = load_bundle(tmp_path / "bundle")
+    assert (policy.action_delay, policy.max_age) == (2, 3)
+    assert Controller(policy).action_delay == 2
+    older = bundle_of(tmp_path / "older", policy_of("a-sac"))  # which does not say it
+    assert load_bundle(older).action_delay == 0
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [b'{"step": 1}', b"3", b"\xff\xfe", b"[" * 100_000, b'{"policy": "agent", "step": -Infinity, "return": 1}']
+    + [
+        b'{"policy": "agent", "step": 120, "return": ' + value + b"}" for value in (b'"a"', b"null", b"9" * 400, b"NaN")
+    ],
+)
+def test_odd_rows_are_one_line(rows: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = run_of(tmp_path / "run", "bpql")
+    (run.path / "rows.jsonl").write_bytes(rows + b"\n")
+    assert "rows.jsonl" in refused(capsys, "export", str(run.path), "--out", str(tmp_path / "bundle"))
+
+
+def test_training_may_go_on_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another checkpoint comes right after the newest was looked up: step and weights are of the same one."""
+    run = run_of(tmp_path / "run", "bpql")
+    latest = Run.latest
+
+    def then_another(self: Run) -> Checkpoint:
+        found = latest(self)
+        run.save(found.step + 120, found.arrays("agent"), None, {}, complete=True)
+        return found
+
+    monkeypatch.setattr(Run, "latest", then_another)
+    assert export_run(run.path, tmp_path / "bundle")["step"] == 240
+
+
 def test_random_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_of(tmp_path / "run", "random")
     assert "no deterministic policy" in refused(capsys, "export", str(tmp_path / "run"), "--out", str(tmp_path / "out"))
@@ -118,6 +166,11 @@ def test_nothing_else_is_overwritten(run: Path, tmp_path: Path, capsys: pytest.C
     assert "not a run folder" in refused(capsys, "export", str(full), "--out", str(tmp_path / "new"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "full"]
     assert (full / "policy.onnx").read_text() == file.read_text() == "mine"
+    for theirs in ('{"format": 1}', '{"format": "esbuild", "policy": {}, "files": {}}', '{"policy": {}', "[]", "\x00"):
+        (full / "bundle.json").write_text(theirs)  # of another program
+        assert "holds no bundle" in refused(capsys, *arguments, str(full), "--force")
+        assert (full / "bundle.json").read_text() == theirs
+    assert "is not empty" in refused(capsys, "export", str(tmp_path / "nowhere"), "--out", str(full))  # said first
 
 
 def test_out_may_be_here(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,6 +214,15 @@ def test_latency(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     text = capsys.readouterr().out
     assert "control period 20 ms" in text
     assert "onnx" not in text
+
+
+@pytest.mark.parametrize("name", ["safetensors", "numpy", "json"])
+def test_a_module_beside_the_bundle_is_not_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = bundle_of(tmp_path / "bundle", policy_of("bpql"))
+    (out / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
+    monkeypatch.chdir(out)
+    assert latency(".", "numpy", decisions=1)
+    assert not (tmp_path / "executed").exists()
 
 
 def test_latency_refuses(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -150,7 +150,8 @@ def test_cards_are_text() -> None:
     evil = "x\n---\n<script>alert(1)</script> | [link](http://evil) \x1b[31m" + "y" * 1000
     metadata = {"agent": evil, "env": evil, "delay": evil, "checksum": "0"}
     metadata["policy"] = {"obs_size": 1, "action_size": 1, "max_age": 0}
-    text = card(metadata)
+    text = card(metadata, "some/pendulum")
+    assert "delayrl pull some/pendulum --out bundle" in text
     assert "<" not in text
     assert "\x1b" not in text
     assert text.count("\n---\n") == 1
@@ -208,6 +209,10 @@ def test_pull_overwrites_nothing(hub: Hub, bundle: Path, tmp_path: Path) -> None
     with pytest.raises(DelayRLError, match="not empty"):
         pull("some/pendulum", bundle)
     pull("some/pendulum", bundle, force=True)
+    hub.asked.clear()
+    with pytest.raises(DelayRLError, match="not empty"):
+        pull("no/where", out)  # before anything is asked for
+    assert hub.asked == []
 
 
 def test_the_hub_says_no(hub: Hub, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from delayrl.deploy.controller import LONGEST, SHORTEST
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
 from delayrl.deploy.network import Act, Network
 from delayrl.deploy.numpy_policy import numpy_policy
@@ -24,6 +25,7 @@ class Bundle:
         low, high: the range of the actions, [A], in the task's own units.
         min_age, max_age: the ages that it was trained for; max_age is Δ.
         dt: seconds between two decisions, where the task says so, else None.
+        action_delay: the longest delay of actions in training, in steps, which is part of the age; 0 where unknown.
         metadata: all of bundle.json.
         backend: what computes: "numpy", "onnx" or "jax".
     """
@@ -34,7 +36,9 @@ class Bundle:
         self.low, self.high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
         self.min_age, self.max_age = 0, network.max_age
         dt: Any = metadata.get("dt")
-        self.dt = float(dt) if type(dt) in (int, float) and 0 < dt < 1e9 else None
+        self.dt = float(dt) if type(dt) in (int, float) and SHORTEST <= dt <= LONGEST else None
+        lag: Any = metadata.get("action_delay")
+        self.action_delay = lag if type(lag) is int and 0 <= lag <= network.max_age else 0
 
     def __call__(self, obs: ArrayLike, actions: ArrayLike, age: int) -> NDArray[np.float32]:
         """The deterministic action, in the task's own units. Nothing is remembered between calls.
@@ -55,7 +59,11 @@ class Bundle:
             age = operator.index(age)
         except TypeError:
             raise DelayRLError(f"an age counts whole steps; got {age!r}") from None
-        obs, actions = np.asarray(obs, np.float32), np.asarray(actions, np.float32)
+        try:
+            with np.errstate(over="ignore"):  # to infinity, which is refused below
+                obs, actions = np.asarray(obs, np.float32), np.asarray(actions, np.float32)
+        except (TypeError, ValueError, OverflowError):
+            raise DelayRLError("the policy takes arrays of numbers: obs [S] and actions [Δ, A]") from None
         if obs.shape != (self.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.obs_size}; got shape {obs.shape}")
         if actions.shape != (self.max_age, self.action_size):

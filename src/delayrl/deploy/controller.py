@@ -14,14 +14,17 @@ k..n-1 are those since. The age counts entries of this list; it is never compute
   - A command g seconds after the newest step began counts as m = ⌊g/dt + ½⌋ steps. The rule is m = 1, however uneven
     the period. m > 1: the plant went on for m - 1 steps without a command; they are in the history, dt apart. m = 0:
     the command before was hardly carried out; the new one takes its place.
-  - An observation belongs to the step whose beginning is nearest to its stamp; halfway counts as the later one. One
-    that was made before step 0 belongs to step 0, and none is younger than `now`.
+  - An observation belongs to the step whose beginning is nearest to its stamp; halfway counts as the later one. None
+    is younger than `now`.
+  - Step 0 begins with the episode: at `reset`, or without one with the first observation or command. The steps before
+    the first command, by the same rounding, had none: so a first observation that comes late is as old as it is.
 
 A command that takes effect κ steps after it was given (`action_delay`) has its step begin κ·dt later. So commands in
 flight are in the history, and an observation that is made now has the age κ.
 """
 
 import math
+import operator
 import threading
 import time
 from collections.abc import Callable
@@ -41,6 +44,10 @@ Stamps = Literal["steps", "seconds"]
 
 KEPT = 64
 """Steps that are remembered beyond Δ + κ. An older observation is an overrun anyway; its age is then an estimate."""
+SHORTEST, LONGEST = 1e-6, 1e6
+"""Seconds of a step."""
+FARTHEST = 1e15
+"""No time is farther from 0, in steps or seconds: beyond, floating point does not tell neighbours apart."""
 
 
 class OverrunError(DelayRLError):
@@ -75,7 +82,8 @@ class Controller:
         policy: see `Policy`. It is asked once here, so that what it compiles at its first call delays no action.
         stamps: "steps" or "seconds", the unit of every stamp and of `now`.
         dt: seconds a step, for stamps in seconds; None for the policy's own.
-        action_delay: steps from a command to its effect, κ. It is part of the age.
+        action_delay: steps from a command to its effect, κ. It is part of the age. None for the policy's own
+            `action_delay`, that of its training; 0 where it has none.
         on_overrun: what `act` does while the newest observation is older than the policy's longest age Δ.
             "hold": the newest action of the history, once more; the policy is not asked.
             "clip": what the policy does at age Δ, for the observation and the first Δ actions after it: the right
@@ -97,7 +105,7 @@ class Controller:
         *,
         stamps: Stamps = "steps",
         dt: float | None = None,
-        action_delay: int = 0,
+        action_delay: int | None = None,
         on_overrun: OnOverrun = "hold",
         idle: ArrayLike | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -106,6 +114,8 @@ class Controller:
             raise DelayRLError(f"stamps are in steps or in seconds; got {stamps!r}")
         if on_overrun not in get_args(OnOverrun):
             raise DelayRLError(f"on_overrun is hold, clip or raise; got {on_overrun!r}")
+        if action_delay is None:
+            action_delay = getattr(policy, "action_delay", 0)
         if isinstance(action_delay, bool) or not isinstance(action_delay, int | np.integer) or action_delay < 0:
             raise DelayRLError(f"action_delay counts whole steps; got {action_delay!r}")
         if action_delay > policy.max_age:
@@ -116,8 +126,9 @@ class Controller:
             raise DelayRLError("dt goes with stamps='seconds'; steps have no length")
         if stamps == "seconds":
             dt = policy.dt if dt is None else dt
-            if dt is None or not (math.isfinite(dt) and dt > 0):
-                raise DelayRLError(f"stamps in seconds need the seconds of a step: give dt=…; got {dt}")
+            if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not SHORTEST <= dt <= LONGEST:
+                allowed = f"{SHORTEST:g} .. {LONGEST:g}"
+                raise DelayRLError(f"stamps in seconds need the seconds of a step, {allowed}: give dt=…; got {dt!r}")
         self.policy, self.stamps, self.on_overrun, self.action_delay = policy, stamps, on_overrun, int(action_delay)
         self._period, self._clock = 1.0 if dt is None else float(dt), clock
         self._idle = None if idle is None else self._action(idle, "idle")
@@ -126,7 +137,7 @@ class Controller:
         self._missed = self._replaced = 0  # of the episodes before
         self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
         self._episode = 0
-        self._begin(-math.inf)
+        self._begin(0.0 if stamps == "steps" else -math.inf)
         policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
 
     @property
@@ -148,10 +159,10 @@ class Controller:
         """Start an episode: forget observations and actions. What was stamped before `now` (seconds) will not be used.
 
         Raises:
-            ClockError: `now` is not finite.
+            ClockError: `now` is not finite, or beyond ±1e15.
         """
         with self._acting, self._state:
-            start = -math.inf if self.stamps == "steps" else self._time(now)
+            start = 0.0 if self.stamps == "steps" else self._time(now)
             self._missed += self._history.missed
             self._replaced += self._history.replaced
             self._episode += 1
@@ -163,14 +174,15 @@ class Controller:
         Args:
             obs: [S].
             stamp: when it was made: how many steps were over, or seconds.
-            now: when it arrived; left out: the steps until now, or the clock.
+            now: when it arrived; left out: the clock, or the steps commanded so far. These stand still until the first
+                command, so give `now` until then: if s_0 is lost, s_1 would be of the future.
             episode: where it belongs, as `controller.episode` counts; None for the present one. Stamps in steps start
                 again at 0: what may still travel when an episode ends must carry it.
 
         Returns:
             "new" if it is the newest now. Else why it is not used: "late" (older than the newest, or of another
-            episode), "duplicate" (the newest's stamp; the first one counts), "invalid" (not finite, or a step below 0),
-            "future" (stamped more than half a period after `now`).
+            episode), "duplicate" (the newest's stamp; the first one counts), "invalid" (not finite in single precision,
+            a step below 0, or a stamp beyond ±1e15), "future" (stamped more than half a period after `now`).
 
         Raises:
             DelayRLError: another size, a stamp that is no number or a fraction of a step: mistakes of a program,
@@ -187,6 +199,8 @@ class Controller:
             self._counts[arrival] += 1
             if arrival == "new":
                 self._obs, self._stamp = values, stamp
+                if self._start == -math.inf:
+                    self._start = stamp
         return arrival
 
     def act(self, now: float | None = None) -> Action:
@@ -214,6 +228,7 @@ class Controller:
                 if self._stamp > now + self._period / 2:
                     raise ClockError(f"time went backwards: now is {now:g}, an observation of {self._stamp:g} is here")
                 step, age, since = self._history.age(self._stamp, now, self._elapsed(now))
+                warm = self._first is not None and step > self._first
                 obs, stamp, action = self._obs.copy(), self._stamp, self._history.last.copy()
                 if age > limit:
                     self._counts["overruns"] += 1
@@ -229,7 +244,7 @@ class Controller:
             with self._state:
                 before = self._record(action, now)
                 self._counts["decisions"] += 1
-                if step > 0:
+                if warm:
                     self._ages.add(age)
                     if self.stamps == "seconds":
                         self._delays.add(now - stamp)
@@ -263,7 +278,7 @@ class Controller:
         """
         values = self._action(action, "the action")
         with self._state:
-            step = self._history.length - 1 if step is None else step
+            step = self._history.length - 1 if step is None else _whole(step)
             if not 0 <= step < self._history.length:
                 raise DelayRLError(f"there are actions of {self._history.length} steps, from 0 on; got step {step}")
             return self._history.correct(values, step)
@@ -292,20 +307,27 @@ class Controller:
         kept = policy.max_age + self.action_delay + KEPT
         self._history = History(self._period, self.action_delay, kept, self._idle, first)
         self._obs = None
-        self._stamp, self._start = -math.inf, start
+        self._stamp, self._start = -math.inf, start  # start: -inf if the first observation or command is to say it
         self._last = -math.inf  # when the last command was given
+        self._first: int | None = None  # steps before the first command
 
     def _record(self, action: Action, now: float) -> float:
-        self._history.record(action, now, self._elapsed(now))
+        if self._start == -math.inf:
+            self._start = now
+        elapsed = self._elapsed(now)
+        self._first = elapsed if self._first is None else self._first
+        self._history.record(action, now, elapsed)
         before, self._last = self._last, now
         return before
 
     def _elapsed(self, now: float) -> int:
-        """Steps before the first command: steps are counted from the start of the episode on, seconds from there."""
-        return int(now) if self.stamps == "steps" else 0
+        """Steps from the start of the episode to `now`: without a command, if the first one is given then."""
+        return max(0, math.floor((now - self._start) / self._period + 0.5))
 
     def _judge(self, values: NDArray[Any], stamp: float, now: float | None, episode: int | None) -> Arrival:
-        if not (np.isfinite(values).all() and math.isfinite(stamp)) or (self.stamps == "steps" and stamp < 0):
+        with np.errstate(over="ignore"):  # policies compute in single precision
+            finite = np.isfinite(values.astype(np.float32)).all()
+        if not (finite and abs(stamp) <= FARTHEST) or (self.stamps == "steps" and stamp < 0):
             return "invalid"
         if (episode is not None and episode != self._episode) or stamp < self._start:
             return "late"
@@ -327,18 +349,22 @@ class Controller:
     def _time(self, now: float | None) -> float:
         """`now`, or what stands for it."""
         if now is None:
-            return self._clock() if self.stamps == "seconds" else max(0, self._history.length - self.action_delay)
+            now = self._clock() if self.stamps == "seconds" else max(0, self._history.length - self.action_delay)
         now = self._number(now)
-        if not math.isfinite(now):
-            raise ClockError(f"now must be finite; got {now}")
+        if not abs(now) <= FARTHEST:
+            raise ClockError(f"now must be finite, within ±{FARTHEST:g}; got {now}")
         return now
 
     def _number(self, stamp: float) -> float:
         if isinstance(stamp, bool | np.bool_) or not isinstance(stamp, int | float | np.integer | np.floating):
             raise DelayRLError(f"a time is a number of {self.stamps}; got {stamp!r}")
-        if self.stamps == "steps" and math.isfinite(stamp) and stamp != math.floor(stamp):
+        try:
+            time = float(stamp)
+        except OverflowError:  # a whole number above all floating-point ones
+            time = math.inf if stamp > 0 else -math.inf
+        if self.stamps == "steps" and math.isfinite(time) and time != math.floor(time):
             raise DelayRLError(f"steps are whole numbers; got {stamp!r}. For seconds: stamps='seconds'")
-        return float(stamp)
+        return time
 
     def _action(self, action: ArrayLike, what: str) -> Action:
         values = _numbers(action, np.float32)
@@ -349,6 +375,14 @@ class Controller:
 
 def _numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
     try:
-        return np.array(values, dtype)
-    except (TypeError, ValueError) as error:
-        raise DelayRLError(f"a flat array of numbers is needed; got {values!r}") from error
+        with np.errstate(over="ignore"):  # to infinity, which is refused where it matters
+            return np.array(values, dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DelayRLError(f"a flat array of numbers is needed; got {' '.join(repr(values).split())[:80]}") from error
+
+
+def _whole(step: int) -> int:
+    try:
+        return operator.index(step)
+    except TypeError:
+        raise DelayRLError(f"a step is a whole number; got {step!r}") from None

@@ -7,14 +7,15 @@ import numpy as np
 import safetensors.numpy
 from gymnasium.spaces import Box
 
-from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, seal, write_files
+from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
 from delayrl.deploy.network import Arrays, Network
 from delayrl.deploy.onnx_graph import onnx_graph
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
-from delayrl.policy import Policy, load
+from delayrl.policy import Policy, restored
 from delayrl.provenance import versions
 from delayrl.runs import Run, flatten_tree
+from delayrl.wrappers.single import seconds_of
 
 
 def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict[str, Any]:
@@ -31,8 +32,11 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict
     Raises:
         DelayRLError: no run, an agent without a deterministic policy, a folder that holds something else.
     """
-    policy = load(run)
-    metadata = describe(Run(Path(run)), policy.spec.delay)
+    check_target(Path(out), force=force)
+    source = Run(Path(run))
+    config, checkpoint = source.config, source.latest()  # once: training may go on meanwhile
+    policy = restored(config, checkpoint)
+    metadata = describe(source, checkpoint.step, policy.spec.delay)
     write_files(Path(out), bundle_files(policy, metadata), force=force)
     return metadata
 
@@ -83,20 +87,20 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     return network, arrays
 
 
-def describe(run: Run, longest: int) -> dict[str, Any]:
+def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
     """All that a bundle says of its run: task, spaces, seconds a step, delay, training, and the last evaluation."""
-    config, step = run.config, run.latest().step
-    env = make(config["env"])
+    config = run.config
+    env = make(config["env"], config["delay"])
     observations, actions = env.observation_space, env.action_space
     assert isinstance(observations, Box)
     assert isinstance(actions, Box)
-    dt = getattr(env.unwrapped, "dt", None)
     env.close()
     kept = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
         **{name: config.get(name) for name in kept},
         "ages": [0, longest],
-        "dt": float(dt) if isinstance(dt, int | float | np.floating) else None,
+        "action_delay": env.delay.action.maximum,
+        "dt": seconds_of(env),
         "observation": _space(observations),
         "action": _space(actions),
         "normalisation": {
@@ -118,11 +122,14 @@ def _space(space: Box) -> dict[str, Any]:
 
 def _evaluation(run: Run, step: int) -> dict[str, Any] | None:
     """Of the last evaluation up to the checkpoint; None where there was none yet."""
-    rows = [row for row in run.read("rows") if row["policy"] == "agent" and row["step"] <= step]
-    if not rows:
-        return None
-    last = max(row["step"] for row in rows)
-    returns = [float(row["return"]) for row in rows if row["step"] == last]
+    try:
+        rows = [row for row in run.read("rows") if row["policy"] == "agent" and int(row["step"]) <= step]
+        if not rows:
+            return None
+        last = max(int(row["step"]) for row in rows)
+        returns = [float(row["return"]) for row in rows if row["step"] == last]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DelayRLError(f"{run.path / 'rows.jsonl'} is damaged: it holds a row that is none of ours") from error
     if not np.isfinite(returns).all():
         raise DelayRLError(f"{run.path / 'rows.jsonl'} holds a return that is not finite")
     return {

@@ -88,6 +88,23 @@ def checksum(document: Mapping[str, Any]) -> str:
     return _digest(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())
 
 
+def check_target(out: Path, *, force: bool = False) -> None:
+    """DelayRLError unless a bundle may be put there: a new or empty folder, or with `force` one with a bundle in it."""
+    try:
+        if not (out.exists() or out.is_symlink()):
+            return
+        if not out.is_dir():
+            raise DelayRLError(f"{out} exists and is no folder; give another --out")
+        if not any(out.iterdir()):
+            return
+        if not force:
+            raise DelayRLError(f"{out} is not empty; give another --out, or --force to replace a bundle in it")
+        if not _is_bundle(out / DOCUMENT):
+            raise DelayRLError(f"{out} is not empty and holds no bundle; give another --out")
+    except OSError as error:
+        raise DelayRLError(f"cannot write to {out}: {error.strerror or error}") from error
+
+
 def write_files(out: Path, files: Mapping[str, bytes], *, force: bool = False) -> None:
     """Put a bundle's files in place, in a folder that is new or empty; with `force` over an older bundle.
 
@@ -96,14 +113,8 @@ def write_files(out: Path, files: Mapping[str, bytes], *, force: bool = False) -
     Raises:
         DelayRLError: the folder holds something else, or the disk refuses.
     """
+    check_target(out, force=force)
     try:
-        if out.exists() or out.is_symlink():
-            if not out.is_dir():
-                raise DelayRLError(f"{out} exists and is no folder; give another --out")
-            if any(out.iterdir()) and not force:
-                raise DelayRLError(f"{out} is not empty; give another --out, or --force to replace a bundle in it")
-            if any(out.iterdir()) and not (out / DOCUMENT).is_file():
-                raise DelayRLError(f"{out} is not empty and holds no bundle; give another --out")
         home = out.resolve()  # "." has no name
         draft = home.with_name(f".{home.name}.{os.getpid()}.draft")
         shutil.rmtree(draft, ignore_errors=True)
@@ -134,7 +145,7 @@ def _parsed(data: bytes, file: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or "format" not in document:
         raise DelayRLError(f"{file} is damaged, or of another program: it has no format")
     if type(document["format"]) is not int or document["format"] != FORMAT:
-        raise DelayRLError(f"{file} has format {str(document['format'])[:20]}; this version reads {FORMAT}")
+        raise DelayRLError(f"{file} has format {document['format']!r:.40}; this version reads {FORMAT}")
     try:
         same = document.get("checksum") == checksum(document)
     except (ValueError, RecursionError):  # e.g. half of a surrogate pair
@@ -142,6 +153,16 @@ def _parsed(data: bytes, file: Path) -> dict[str, Any]:
     if not same:
         raise DelayRLError(f"{file} was changed after it was written: its checksum is another one")
     return document
+
+
+def _is_bundle(file: Path) -> bool:
+    """Whether it is a bundle's document, of whatever format and with whatever sums: a damaged one may be replaced."""
+    try:
+        document = json.loads(_read(file))
+    except (ValueError, RecursionError, DelayRLError):
+        return False
+    kinds = {"format": int, "policy": dict, "files": dict}
+    return isinstance(document, dict) and all(isinstance(document.get(name), kind) for name, kind in kinds.items())
 
 
 def _no_number(text: str) -> None:
@@ -181,7 +202,7 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     try:
         return safetensors.numpy.load(data)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError, OverflowError, MemoryError) as error:
-        raise DelayRLError(f"it is no safetensors file that we write ({str(error).splitlines()[0][:80]})") from error
+        raise DelayRLError(f"it is no safetensors file that we write ({str(error)[:80]!r})") from error
 
 
 def _digest(data: bytes) -> str:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from delayrl.deploy.files import DOCUMENT, GRAPH, LIMITS, WEIGHTS, check_files, read_files, write_files
+from delayrl.deploy.files import DOCUMENT, GRAPH, LIMITS, WEIGHTS, check_files, check_target, read_files, write_files
 from delayrl.errors import DelayRLError
 
 CARD = "README.md"
@@ -32,7 +32,7 @@ def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
     hub, api = _hub()
     with _one_line(f"cannot push to {repo}"):
         url = api.create_repo(repo, private=private, exist_ok=True)
-        content = {CARD: card(metadata).encode(), **files}
+        content = {CARD: card(metadata, repo).encode(), **files}
         operations = [hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=data) for name, data in content.items()]
         api.create_commit(repo, operations, commit_message=f"delayrl bundle {metadata['checksum'][:12]}")
     return str(url)
@@ -47,6 +47,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
     Raises:
         DelayRLError: no such repository, no bundle in it, a broken one, a folder that holds something else.
     """
+    check_target(Path(out), force=force)
     _, api = _hub()
     names = [DOCUMENT, WEIGHTS, GRAPH]
     with tempfile.TemporaryDirectory(prefix="delayrl-pull-") as aside:
@@ -71,7 +72,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
     return metadata
 
 
-def card(metadata: Mapping[str, Any]) -> str:
+def card(metadata: Mapping[str, Any], repo: str) -> str:
     """The model card: what the metadata says, and how to use it."""
     policy, evaluation = metadata["policy"], metadata.get("evaluation")
     agent, env, delay = (plain(metadata.get(name)) for name in ("agent", "env", "delay"))
@@ -101,7 +102,7 @@ def card(metadata: Mapping[str, Any]) -> str:
         "",
         "```",
         "pip install 'delayrl[hub]'",
-        "delayrl pull OWNER/NAME --out bundle",
+        f"delayrl pull {repo} --out bundle",
         "```",
         "",
         "```python",
@@ -135,5 +136,5 @@ def _one_line(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # of the network, of its client, of its client's client: all end here
-        line = (str(error).strip().splitlines() or [""])[0].strip()
+        line = "".join(filter(str.isprintable, (str(error).strip().splitlines() or [""])[0]))
         raise DelayRLError(f"{what}: {line[:200] or type(error).__name__}") from error

@@ -49,7 +49,8 @@ def latency(
     if not 1 <= decisions <= 10_000_000:
         raise DelayRLError(f"decisions must lie in 1 .. 10,000,000; got {decisions}")
     task = json.dumps([str(bundle), backend, decisions, None if ages is None else list(ages)])
-    command = [sys.executable, "-m", "delayrl.deploy.latency", task]
+    # -P: a module that lies in this folder, which may be the bundle's, is not ours
+    command = [sys.executable, "-P", "-m", "delayrl.deploy.latency", task]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, capture_output=True, text=True)
     if done.returncode:
         raise DelayRLError((done.stderr.strip().splitlines() or [f"the measurement of {backend} broke off"])[-1])

@@ -14,6 +14,8 @@ Arrays = Mapping[str, NDArray[np.float32]]
 Act = Callable[[NDArray[np.float32], NDArray[np.float32], int], NDArray[np.float32]]
 """obs [S], actions [Δ, A] in the task's units, age -> action [A] in the task's units."""
 INPUTS = ("observation", "augmented", "transformer")
+LONGEST_AGE, LARGEST_HISTORY = 10_000, 10_000_000
+"""No policy has more steps, or numbers, in its history: a small file must not ask for much memory."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +129,13 @@ def parse(document: Any) -> Network:
     low, high = (bounds(name, sizes["action_size"]) for name in ("low", "high"))
     if not all(b - a > 1e-30 for a, b in zip(low, high, strict=True)):
         raise DelayRLError("its policy's low must lie below its high")
+    if sizes["max_age"] > LONGEST_AGE or sizes["max_age"] * sizes["action_size"] > LARGEST_HISTORY:
+        raise DelayRLError(f"its policy's max_age is above {LONGEST_AGE:,}, or its history too large")
     kind = document.get("input")
     if kind not in INPUTS or (sizes["max_age"] == 0 and kind != "observation"):
         raise DelayRLError(f"its policy's input must be one of {', '.join(INPUTS)}; the latter two need an age")
+    if kind == "transformer" and document.get("current") is None:
+        raise DelayRLError("its policy's input is transformer, which gives nothing at age 0: it needs a current")
     least = int(kind == "transformer")
     return Network(
         **sizes,

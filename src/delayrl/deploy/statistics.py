@@ -9,8 +9,9 @@ class Statistics:
     """What happened since the controller was made, over all episodes.
 
     `age_*`, `delay_*` and `period_*` leave the cold start out: a decision counts from the first one of its episode on
-    whose observation was made after step 0. Before, the age only shows how long the episode has run. They
-    are NaN while nothing has been counted (`age_max`: 0); `delay_*` and `period_*` also with stamps in steps.
+    whose observation was made after the first command. Before, the age only shows how long the episode has run. Ages of
+    decisions that `on_overrun="raise"` refused are not in; `overruns` counts these. They are NaN while nothing has been
+    counted (`age_max`: 0); `delay_*` and `period_*` also with stamps in steps.
 
     Attributes:
         decisions: actions chosen by `act`.
@@ -22,14 +23,14 @@ class Statistics:
         delay_std: its jitter.
         period_mean: seconds between two commands.
         period_std: its jitter.
-        overruns: decisions whose age was above the policy's longest, the cold start included.
+        overruns: decisions whose age was above the policy's longest, refused ones and the cold start included.
         missed: steps without a command of their own.
         replaced: commands whose place was taken by one less than half a period later.
         overridden: commands of somebody else.
         new: observations that were used.
         late: observations older than one that had arrived before, or of an episode that is over.
         duplicate: observations with the stamp of the newest.
-        invalid: observations with values or stamps that are not finite, or of steps below 0.
+        invalid: observations with values or stamps that are not finite or beyond reach, or of steps below 0.
         future: observations stamped more than half a period after they arrived.
     """
 

@@ -16,6 +16,7 @@ from delayrl.delays import Channel, Delay, DelayLaw
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError
 from delayrl.wrappers import Delayed, check_spaces
+from delayrl.wrappers.single import seconds_of
 from delayrl.wrappers.transit import Fill
 
 probe.register()
@@ -117,7 +118,7 @@ def tasks() -> Iterator[Task]:
         spaces = (env.observation_space.shape, env.action_space.shape)
         limit = env.spec.max_episode_steps if env.spec else None
         high = float(np.max(env.action_space.high))  # type: ignore[attr-defined]
-        yield Task(name, spaces[0][0], spaces[1][0], high, limit, getattr(env.unwrapped, "dt", None))  # type: ignore[index]
+        yield Task(name, spaces[0][0], spaces[1][0], high, limit, seconds_of(env))  # type: ignore[index]
         env.close()
 
 
