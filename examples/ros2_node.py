@@ -1,12 +1,17 @@
 """A ROS 2 node that runs a delayed policy: JointState in, Float64MultiArray out.
 
-python examples/ros2_node.py --ros-args -p policy:=BUNDLE -p on_overrun:=hold -p action_delay:=0
+python examples/ros2_node.py --ros-args -p policy:=BUNDLE -p on_overrun:=raise -p idle:="[0.0, 0.0]"
+
+Further parameters: `action_delay` and `dt`; below 0 (their default) they are the policy's own. `idle` is what the
+drives do in a period without a command; without it, they are taken to go on with the command before. While the newest
+observation is older than the policy can use, no command is published (`on_overrun`: `raise`; or `hold`, `clip`).
 
 The observation is [position…, velocity…] of the JointState, in the order of the policy's task; its age comes from
 `header.stamp`, which must be the time of the measurement, on the clock of this node (`use_sim_time` works). rclpy is
 imported when the node is made: it comes with ROS and not from PyPI.
 """
 
+import math
 import sys
 from typing import Any
 
@@ -54,6 +59,8 @@ def make_node(policy: Policy, **settings: Any) -> Any:
                 action = self.controller.act()
             except OverrunError as error:  # no command: the drive's own watchdog stops it
                 self.get_logger().error(str(error))
+                if settings.get("idle") is not None:
+                    self.controller.override(settings["idle"])
                 return
             except DelayRLError as error:
                 self.get_logger().warning(str(error))
@@ -71,6 +78,17 @@ def make_node(policy: Policy, **settings: Any) -> Any:
     return DelayedPolicy()
 
 
+def settings_of(node: Any) -> dict[str, Any]:
+    """What the parameters say, as `make_node` takes it, and `policy`."""
+    # ROS takes the types of parameters from their defaults: an empty list has none, so NaN stands for no idle action
+    defaults = {"policy": "", "on_overrun": "raise", "action_delay": -1, "dt": -1.0, "idle": [math.nan]}
+    values = {name: node.declare_parameter(name, default).value for name, default in defaults.items()}
+    for name in ("action_delay", "dt"):
+        values[name] = None if values[name] < 0 else values[name]
+    values["idle"] = None if np.isnan(values["idle"]).any() else list(values["idle"])
+    return values
+
+
 def main() -> None:
     import rclpy
     from rclpy.node import Node
@@ -79,10 +97,7 @@ def main() -> None:
 
     rclpy.init()
     parameters = Node("delayed_policy_parameters")
-    values = {
-        name: parameters.declare_parameter(name, default).value
-        for name, default in {"policy": "", "on_overrun": "hold", "action_delay": 0}.items()
-    }
+    values = settings_of(parameters)
     try:
         node = make_node(load_bundle(values.pop("policy")), **values)
     except DelayRLError as error:

@@ -44,9 +44,12 @@ class Told:
 
 
 def lockstep(controller: Controller, line: socket.socket, told: Told) -> None:
-    """Answer every tick once; a tick that comes again gets the same answer."""
+    """Answer every tick once; a tick that comes again gets the same answer.
+
+    Before the first observation it answers zeros, which the plant does by itself: no command.
+    """
     arrived: dict[int, np.ndarray] = {}
-    answer = b""
+    answer, answered = b"", -1
     line.send(encode(HELLO, 0, 0))
     while True:
         packet = decode(line.recv(65_535))
@@ -58,21 +61,23 @@ def lockstep(controller: Controller, line: socket.socket, told: Told) -> None:
             controller.reset()
             arrived.clear()
             told.forget()
+            answered = -1
         if packet.episode != controller.episode:
             continue
         if packet.kind == OBSERVATION:
             arrived[packet.step] = packet.values
         elif packet.kind == APPLIED:
             told.take(packet)
-        elif packet.kind == TICK and packet.step == controller.step + 1:
+        elif packet.kind == TICK and packet.step == answered + 1:
             due = [int(k) for k in packet.values]
             if all(k in arrived for k in due):  # else it comes again
                 for k in due:
-                    controller.observe(arrived[k], k)
-                action = controller.act()
-                answer = encode(ACTION, packet.episode, packet.step, 0.0, action)
+                    controller.observe(arrived[k], k, packet.step)
+                nothing = np.zeros(controller.policy.action_size, np.float32)
+                action = controller.act(packet.step) if controller.ready else nothing
+                answer, answered = encode(ACTION, packet.episode, packet.step, 0.0, action), packet.step
                 line.send(answer)
-        elif packet.kind == TICK and packet.step == controller.step:
+        elif packet.kind == TICK and packet.step == answered:
             line.send(answer)
 
 
@@ -97,10 +102,10 @@ def real_time(controller: Controller, line: socket.socket, told: Told) -> None:
                         over = True
                     elif packet.kind == PAUSE and packet.episode == controller.episode:
                         begun = None
-                    elif packet.kind == OBSERVATION and packet.step == 0 and packet.episode == controller.episode + 1:
-                        controller.reset(packet.stamp)
+                    elif packet.kind == OBSERVATION and packet.episode == controller.episode + 1:
+                        begun = packet.stamp - packet.step * dt
+                        controller.reset(begun)
                         told.forget()
-                        begun = packet.stamp
                     if packet.kind == OBSERVATION:
                         controller.observe(packet.values, packet.stamp, episode=packet.episode)
                     elif packet.kind == APPLIED and packet.episode == controller.episode:
@@ -157,7 +162,8 @@ def main() -> None:
     try:
         stamps = "seconds" if given.real_time else "steps"
         policy = load(given.policy, given.blind)
-        controller = Controller(policy, stamps=stamps, on_overrun=given.on_overrun)
+        # this plant carries out commands at once, whatever the policy was trained for
+        controller = Controller(policy, stamps=stamps, action_delay=0, on_overrun=given.on_overrun)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             line.settimeout(PATIENCE)
             line.connect(("127.0.0.1", given.port))  # packets of others are not delivered

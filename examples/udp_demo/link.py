@@ -12,7 +12,8 @@ class Link:
 
     `low` and `high` bound the travel time in steps: whole steps in lockstep, any time between in real time; each
     observation draws its own, so they overtake each other. `loss` and `double` are probabilities; so is `missed`, that
-    a command gets lost on its way back (in lockstep; the plant then goes on with the one before).
+    a command gets lost on its way back (in lockstep; the plant then goes on with the one before). The first observation
+    is never lost and travels for `first` steps.
     """
 
     low: float = 0
@@ -20,10 +21,11 @@ class Link:
     loss: float = 0.0
     double: float = 0.0
     missed: float = 0.0
+    first: int = 0
 
 
 class Travelling:
-    """Observations of one episode on their way. The first one arrives at once: an episode starts from a known state.
+    """Observations of one episode on their way.
 
     Args:
         link: the network.
@@ -46,7 +48,7 @@ class Travelling:
             else random.uniform(link.low, link.high, 2)
         )
         if step == 0:
-            lost, travels[0] = False, 0
+            lost, travels[0] = False, self._link.first
         for travel in travels[: 0 if lost else 1 + int(doubled)]:
             heapq.heappush(self._queue, (step + float(travel), step))
 

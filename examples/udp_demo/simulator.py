@@ -141,13 +141,14 @@ def main() -> None:
     parser.add_argument("--loss", type=float, default=0.0, help="probability that an observation is lost")
     parser.add_argument("--double", type=float, default=0.0, help="probability that it arrives twice")
     parser.add_argument("--missed", type=float, default=0.0, help="probability that a command is lost")
+    parser.add_argument("--first", type=int, default=0, help="travel of the first observation, steps")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, help="end episodes early")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--real-time", action="store_true")
     given = parser.parse_args()
 
-    link = Link(given.low, given.high, given.loss, given.double, given.missed)
+    link = Link(given.low, given.high, given.loss, given.double, given.missed, given.first)
     play: Play = real_time if given.real_time else lockstep
     env = gym.make(given.env, disable_env_checker=True, max_episode_steps=given.steps)
     line = Line()

@@ -114,6 +114,35 @@ def test_no_command_on_an_overrun(example: Any) -> None:
     assert "trained for ages 0..1" in node.log[-1]
 
 
+def test_the_drive_is_idle_on_an_overrun(example: Any) -> None:
+    policy = Counting(2, 1)
+    given = {"dt": 0.02, "idle": [7.0], "action_delay": 0}
+    node = Node("parameters")
+    node.declare_parameter = lambda name, default: SimpleNamespace(value=given.get(name, default))
+    settings = example.settings_of(node)
+    assert settings == given | {"policy": "", "on_overrun": "raise"}
+    settings.pop("policy")
+    node = example.make_node(policy, **settings)
+    node.subscribed["joint_states"](joint_state([0.0], [0.0], Node.now))
+    for _ in range(4):
+        node.timers[0][1]()
+        Node.now += 20_000_000
+    node.subscribed["joint_states"](joint_state([1.0], [0.0], Node.now - 20_000_000))
+    node.timers[0][1]()
+    assert len(node.published) == 3
+    assert policy.calls[-1] == (1.0, [7.0], 1)
+    assert (node.controller.statistics.overridden, node.controller.statistics.overruns) == (2, 2)
+
+
+def test_parameters_left_out_are_the_policys_own(example: Any) -> None:
+    node = Node("parameters")
+    node.declare_parameter = lambda name, default: SimpleNamespace(value=default)
+    assert example.settings_of(node) == {
+        **{"policy": "", "on_overrun": "raise"},
+        **dict.fromkeys(("action_delay", "dt", "idle")),
+    }
+
+
 def test_a_message_of_another_robot_is_no_end(example: Any) -> None:
     node = example.make_node(Counting(2, 1), dt=0.02)
     node.subscribed["joint_states"](joint_state([0.0, 1.0], [0.0], Node.now))

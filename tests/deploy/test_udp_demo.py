@@ -47,6 +47,18 @@ def test_by_the_clock() -> None:
     assert statistics["invalid"] == statistics["future"] == 0
 
 
+def test_a_late_start() -> None:
+    """The first observation is late too: the plant was idle for four steps, and the history says so."""
+    late = Link(4, 5, first=4)
+    episodes, statistics = run("delayed", late, 150)
+    assert [episode["return"] for episode in episodes] == [150, 150]
+    assert (statistics["missed"], statistics["decisions"]) == (8, 292)
+    assert statistics["age_max"] <= 5
+    _, statistics = run("delayed", late, 40, real_time=True)
+    assert statistics["missed"] >= 6  # the fourth command is only late; more are missed on a busy machine
+    assert statistics["invalid"] == statistics["future"] == 0
+
+
 @pytest.mark.parametrize("wrong", ["one action more", "half of them", "newest first", "zeros"])
 def test_the_predictor_falls_on_a_wrong_history(wrong: str) -> None:
     """The control: what the tests above rely on."""

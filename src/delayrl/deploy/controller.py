@@ -98,6 +98,8 @@ class Controller:
     """
 
     _obs: NDArray[np.float64] | None
+    _start: float
+    _first: int | None
 
     def __init__(
         self,
@@ -309,7 +311,7 @@ class Controller:
         self._obs = None
         self._stamp, self._start = -math.inf, start  # start: -inf if the first observation or command is to say it
         self._last = -math.inf  # when the last command was given
-        self._first: int | None = None  # steps before the first command
+        self._first = None  # steps before the first command
 
     def _record(self, action: Action, now: float) -> float:
         if self._start == -math.inf:

@@ -60,4 +60,4 @@ def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
 
 
 def _line(error: Exception) -> str:
-    return repr((str(error).strip().splitlines() or [type(error).__name__])[0][:120])  # it may quote the graph
+    return repr((str(error).strip().splitlines() or [type(error).__name__])[0][:120])  # which may quote the graph
