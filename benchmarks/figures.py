@@ -10,6 +10,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
+from speed import tables as speed
 
 HERE = Path(__file__).parent
 COLOURS = {
@@ -169,6 +170,8 @@ def main() -> None:
         if (HERE / "results" / f"{name}.jsonl").exists():
             for page in pages:
                 insert(root / page, name, table(name) + "\n\n" + provenance(name))
+    for key, text in speed.pages(root).items():
+        insert(root / "docs" / "performance.md", key, text)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What an update costs at least, and where its time goes: `python floor.py SIDE` prints one JSON object.
 
-The floor of a training step is its matrix products' arithmetic at the best rate at which this machine multiplies large
+The floor of a training step is its matrix products' arithmetic at the best rate at which this machine multiplies
 matrices. Parts are timed one by one, each waited for; in training they overlap, so their sum may exceed a step.
 """
 
@@ -16,10 +16,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gate import pin
 
 from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
+from delayrl.agents.base import Phase
 from delayrl.config import override
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
@@ -93,18 +95,16 @@ def rate(left: tuple[int, int], right: tuple[int, int], transposed: str = "", se
     best, until = math.inf, time.perf_counter() + seconds
     while time.perf_counter() < until:
         began = time.perf_counter()
-        for _ in range(4):
-            c = multiply(a, b)
-        c.block_until_ready()
-        best = min(best, (time.perf_counter() - began) / 4)
+        multiply(a, b).block_until_ready()
+        best = min(best, time.perf_counter() - began)
     return size / best
 
 
 def rates(rows: int, width: int) -> dict[str, float]:
-    """Of large squares; and forward, for the weights' gradient and for the inputs', in a square layer of an update."""
+    """Of squares; and forward, for the weights' gradient and for the inputs', in a square layer of an update."""
     x, w = (rows, width), (width, width)
     return {
-        "square": max(rate((1024, 1024), (1024, 1024)), rate((2048, 2048), (2048, 2048))),
+        "square": max(rate((size, size), (size, size)) for size in (512, 1024, 2048)),
         "forward": rate(x, w),
         "weights": rate(x, x, "left"),
         "inputs": rate(x, w, "right"),
@@ -157,26 +157,10 @@ def parts(side: dict[str, Any]) -> dict[str, Any]:
     flops = matmul_flops(partial(agent.act, explore=True), *jax.tree.map(lambda x: x[0], (state, seen)), keys[0])
     costs = []
     for index, phase in enumerate(agent.phases()):
-        count = 2 if phase.updates == 1 else 20  # two updates: SAC's actor learns in every second
-
-        def rounds(state: Any, replay: Any, keys: Any, phase: Any = phase, count: int = count) -> Any:
-            def update(state: Any, i: Any) -> Any:
-                def single(state: Any, replay: Any, key: Any) -> Any:
-                    draw, learn = jax.random.split(jax.random.fold_in(key, i))
-                    reach = (phase.batch, spec.delay, agent.ahead(spec))
-                    windows = ring.sample(replay, draw, *reach, jnp.int32(0))
-                    return phase.update(state, windows, learn, i)[0]
-
-                return jax.vmap(single)(state, replay, keys), None
-
-            return jax.lax.scan(update, state, jnp.arange(count))[0]
-
-        run = jax.jit(rounds)
-        seconds = median_seconds(partial(run, state, replay, keys)) / count
+        reach = (phase.batch, spec.delay, agent.ahead(spec))
+        seconds = update_seconds(phase, reach, state, replay, keys)
         found[f"phase {index}"] = amortised([(phase.every, phase.updates, seconds)])
-        batch = jax.eval_shape(
-            lambda r, k, p=phase: ring.sample(r, k, p.batch, spec.delay, agent.ahead(spec), jnp.int32(0)), one, keys[0]
-        )
+        batch = jax.eval_shape(partial(windows, reach), one, keys[0])
         single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
         cost = matmul_flops(phase.update, single, batch, keys[0], jax.ShapeDtypeStruct((), jnp.int32))
         costs.append((phase.every, phase.updates, cost))
@@ -187,9 +171,33 @@ def parts(side: dict[str, Any]) -> dict[str, Any]:
         "parts": found,
         "flops": flops,
         "rates": rates(rows, getattr(agent, "width", 256)),
+        "obs_size": spec.obs_size,
         "replay_bytes": replay_bytes(spec, capacity),
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
+
+
+def windows(reach: tuple[int, int, int], replay: ring.Replay, key: Any) -> Any:
+    """A batch of one seed."""
+    return ring.sample(replay, key, *reach, jnp.int32(0))
+
+
+def update_seconds(phase: Phase, reach: tuple[int, int, int], state: Any, replay: ring.Replay, keys: Any) -> float:
+    """Of one update of all seeds, sampling included: the mean over both of SAC's turns, or over a short round."""
+    count = 2 if phase.updates == 1 else 20
+
+    def one(state: Any, replay: ring.Replay, key: Any, i: Any) -> Any:
+        draw, learn = jax.random.split(jax.random.fold_in(key, i))
+        return phase.update(state, windows(reach, replay, draw), learn, i)[0]
+
+    @jax.jit
+    def several(state: Any, replay: ring.Replay, keys: Any) -> Any:
+        def update(state: Any, i: Any) -> Any:
+            return jax.vmap(one, in_axes=(0, 0, 0, None))(state, replay, keys, i), None
+
+        return jax.lax.scan(update, state, jnp.arange(count))[0]
+
+    return median_seconds(partial(several, state, replay, keys)) / count
 
 
 def replay_bytes(spec: Any, capacity: int) -> int:
@@ -199,6 +207,7 @@ def replay_bytes(spec: Any, capacity: int) -> int:
 
 
 def main() -> None:
+    pin()
     side = json.loads(sys.argv[1])
     with on_device(side["device"]):
         print(json.dumps(parts(side)))

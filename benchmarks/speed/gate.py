@@ -8,6 +8,7 @@ Runs in the peers' environments too: needs Gymnasium, and nothing of ours.
 """
 
 import json
+import os
 import resource
 import time
 from collections import defaultdict
@@ -18,6 +19,12 @@ from typing import Any, TextIO
 import gymnasium as gym
 
 PREFIX = "delayrl-speed/"
+
+
+def pin() -> None:
+    """Keep this process to as many cores as OpenMP is given: XLA takes the number of its threads from there."""
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, cores[: int(os.environ["OMP_NUM_THREADS"])])
 
 
 class Stop(BaseException):

@@ -23,7 +23,7 @@ TIMEOUT = 900
 """Seconds after which a side that says nothing is given up: the first line waits for its compilation."""
 
 
-class Failed(Exception):
+class MeasurementError(Exception):
     """A side that cannot be measured, in one line."""
 
 
@@ -34,15 +34,15 @@ class Side:
         self.name, self.side = side["kind"], side
         self._log = HERE / "logs" / f"{side['name']}-{side['kind']}.log"
         self._log.parent.mkdir(exist_ok=True)
-        self._process = subprocess.Popen(
-            [python, str(HERE / "worker.py"), json.dumps(side)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._log.open("w"),
-            text=True,
-            env=environment(threads),
-            preexec_fn=lambda: pin(threads),
-        )
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                [python, str(HERE / "worker.py"), json.dumps(side)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                env=environment(threads),
+            )
         self.hello = self._read()
 
     def slice(self, steps: int) -> dict[str, Any]:
@@ -55,12 +55,14 @@ class Side:
     def close(self) -> None:
         """Stop it, politely first."""
         assert self._process.stdin is not None
+        assert self._process.stdout is not None
         self._process.stdin.close()
         try:
             self._process.wait(20)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._process.stdout.close()
 
     def _read(self) -> dict[str, Any]:
         assert self._process.stdout is not None
@@ -68,10 +70,10 @@ class Side:
         line = self._process.stdout.readline() if ready else ""
         if not line:
             self._process.kill()
-            self._process.wait()
+            self.close()
             said = [words for words in self._log.read_text().splitlines() if words.strip()]
             why = said[-1] if ready and said else "it ended" if ready else f"nothing within {TIMEOUT} s"
-            raise Failed(f"{self.name} cannot be measured: {why} (log: {self._log})")
+            raise MeasurementError(f"{self.name} cannot be measured: {why} (log: {self._log})")
         return json.loads(line)
 
 
@@ -86,12 +88,6 @@ def environment(threads: int) -> dict[str, str]:
         "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.3",
         "PYTHONUNBUFFERED": "1",
     }
-
-
-def pin(threads: int) -> None:
-    """Keep a process to so many cores: XLA takes its threads' number from there."""
-    cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, cores[:threads])
 
 
 def quartiles(values: list[float]) -> dict[str, float]:
@@ -113,7 +109,11 @@ def summary(side: dict[str, Any], steps: int, slices: list[dict[str, Any]]) -> d
         "processor": quartiles([s["processor"] / count for s in slices]),
         "peak_bytes": max(s["peak_bytes"] for s in slices),
         "slices": [float(f"{s:.4g}") for s in seconds],
-    } | ({"parts": {p: quartiles([s["parts"].get(p, 0) / count for s in slices]) for p in sorted(parts)}} if parts else {})
+    } | (
+        {"parts": {p: quartiles([s["parts"].get(p, 0) / count for s in slices]) for p in sorted(parts)}}
+        if parts
+        else {}
+    )
 
 
 def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
@@ -126,12 +126,12 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
             python = interpreter(side["kind"], args)
             if python is None:
                 if role == "ours":
-                    raise Failed(f"{work.name} is ours alone")
+                    raise MeasurementError(f"{work.name} is ours alone")
                 say(f"  {side['kind']} is left out: its environment is not given")
                 continue
             try:
                 open_sides[role] = Side(python, side, args.threads)
-            except Failed as error:
+            except MeasurementError as error:
                 say(f"  {error}")
                 if role == "ours":
                     return None
@@ -144,8 +144,6 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
                 slices[role].append(side_process.slice(steps))
             load.append(os.getloadavg()[0])
             number += 1
-            if args.limit and time.perf_counter() > until + args.limit:
-                break
     finally:
         for side_process in open_sides.values():
             side_process.close()
@@ -190,7 +188,6 @@ def floor(side: dict[str, Any], args: argparse.Namespace) -> dict[str, Any] | No
         capture_output=True,
         text=True,
         env=environment(args.threads),
-        preexec_fn=lambda: pin(args.threads),
     )
     if done.returncode:
         say(f"  no floor: {(done.stderr.strip().splitlines() or ['it ended'])[-1]}")
@@ -199,7 +196,7 @@ def floor(side: dict[str, Any], args: argparse.Namespace) -> dict[str, Any] | No
 
 
 def complete(side: dict[str, Any], work: Work, steps: int, args: argparse.Namespace) -> dict[str, Any]:
-    """A side with all that its worker must know. A clone round every slice: one KL update a step, as the papers have."""
+    """A side with all that its worker must know. Cloning once a slice is one KL update a step, as scheduled."""
     options = dict(side.get("options", {}))
     if side.get("agent") == "vdpo":
         options |= {"clone_every": steps, "clone_updates": steps}
@@ -208,7 +205,12 @@ def complete(side: dict[str, Any], work: Work, steps: int, args: argparse.Namesp
     if side["kind"] == "ours":
         options |= dict(args.set)
     path = {"vdpo": args.vdpo, "cleanrl": args.cleanrl}.get(side["kind"])
-    fixed = {"name": work.name, "device": args.device, "path": path and str(Path(path).resolve()), "warmup": 2 * steps + 4}
+    fixed = {
+        "name": work.name,
+        "device": args.device,
+        "path": path and str(Path(path).resolve()),
+        "warmup": steps + 4,
+    }
     return {"seeds": 1, "delay": 0, **fixed, **side, "options": options}
 
 
@@ -268,15 +270,19 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--torch-python", metavar="PYTHON", help="Python with torch: Stable-Baselines3, CleanRL, VDPO")
     parser.add_argument("--jax-python", metavar="PYTHON", help="Python with SBX")
     parser.add_argument("--threads", type=int, default=min(os.cpu_count() or 1, 16), help="cores for each side")
-    parser.add_argument("--rounds", type=int, default=9, help="at least so many slices of each side")
+    parser.add_argument("--rounds", type=int, help="at least so many slices of each side (9; 5 on a GPU, 3 of --sizes)")
     parser.add_argument("--most", type=int, default=41, help="at most so many")
-    parser.add_argument("--seconds", type=float, default=60, help="go on so long beyond --rounds")
-    parser.add_argument("--limit", type=float, default=0, help="stop so many seconds later, however few the rounds")
+    parser.add_argument("--seconds", type=float, help="go on beyond --rounds until so long (30; 3 of --sizes)")
     parser.add_argument("--steps", type=int, help="environment steps of a slice, for trying out")
     parser.add_argument("--set", type=pair, action="append", default=[], metavar="NAME=VALUE", help="an option of ours")
     parser.add_argument("--no-floor", action="store_true", help="without parts and floor")
     parser.add_argument("--out", type=Path, default=RESULTS)
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.rounds is None:
+        args.rounds = 3 if args.sizes else 5 if args.device == "gpu" else 9
+    if args.seconds is None:
+        args.seconds = 3 if args.sizes else 30
+    return args
 
 
 def main() -> int:
@@ -295,6 +301,9 @@ def main() -> int:
             say(f"{name}: {path} is no folder; give a checkout")
             return 2
     chosen = args.works or [w.name for w in (SIZES if args.sizes else WORKS).values() if args.device in w.steps]
+    if elsewhere := [name for name in chosen if not args.steps and args.device not in known[name].steps]:
+        say(f"{', '.join(elsewhere)} has no slice length for {args.device}; give --steps")
+        return 2
     began = time.perf_counter()
     for number, name in enumerate(chosen):
         gone = time.perf_counter() - began
@@ -302,7 +311,7 @@ def main() -> int:
         say(f"{name} ({number + 1} of {len(chosen)}{left})")
         try:
             row = compare(known[name], args)
-        except Failed as error:
+        except MeasurementError as error:
             say(f"  {error}")
             continue
         if row:

@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from gate import Gate, Stop, register
+from gate import Gate, Stop, pin, register
 
 CAPACITY = 1_000_000
 """Rows of everybody's replay: what the papers train with."""
@@ -46,10 +46,10 @@ def ours(side: dict[str, Any], gate: Gate) -> None:
 
 
 def vdpo(side: dict[str, Any], gate: Gate) -> None:
-    """The released code's trainer, unchanged: it reads the global `config` of its module, and logs as it always does."""
+    """The released trainer, unchanged: it reads the global `config` of its module, and logs as it always does."""
     sys.path.insert(0, side["path"])
     import torch
-    import VDPO as released
+    import VDPO as released  # noqa: N811
 
     config = vars(released.parser.parse_args([])) | {
         "env": register(gate, side["env"]),
@@ -173,6 +173,7 @@ def hello() -> dict[str, Any]:
 
 def main() -> None:
     """Start the side; its prints go to stderr, the reports alone to stdout."""
+    pin()
     side = json.loads(sys.argv[1])
     reports = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
