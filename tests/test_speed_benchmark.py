@@ -138,3 +138,17 @@ def test_both_sides_clone_once_a_slice() -> None:
     assert sides["peer"]["options"]["kl_freq"] == 20
     assert sides["peer"]["options"]["embedding_dim"] == sides["ours"]["options"]["width"]
     assert len(SIZES) > 10
+
+
+def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
+    """Every row shows, what was not run is empty, and where the peer is faster it is said."""
+    rows = tables.rows()
+    assert rows
+    works = [row for row in rows if not row["work"].startswith("size-")]
+    assert tables.compared(rows).count("\n") == len(works) + 1
+    assert tables.sizes(rows).count("\n") == len(SIZES) + 1
+    slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
+    assert "ratio 0.50" in tables.behind([slow])
+    assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
+    tables.draw_sizes(rows, tmp_path / "sizes.png")
+    assert (tmp_path / "sizes.png").stat().st_size > 5000

@@ -36,6 +36,22 @@ def compared(found: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def behind(found: list[Row]) -> str:
+    """A sentence for each work in which the peer is faster: our distance from the floor, and our longest part."""
+    lines = []
+    for row in (r for r in found if "peer" in r and r["ratio"]["median"] < 1):
+        line = f"**The peer is faster** in: {row['title']} (ratio {row['ratio']['median']:.2f})."
+        if floor := row.get("floor"):
+            names = {"phase 0": "SAC and belief", "phase 1": "cloning"}
+            longest = max(floor["parts"], key=floor["parts"].get)
+            share = floor["parts"][longest] / sum(floor["parts"].values())
+            times = row["ours"]["processor"]["median"] / row["threads"] / floor_seconds(row)
+            line += f" Our processor time is {times:.1f} times the floor below; {share:.0%} of the parts' sum is "
+            line += f"{names.get(longest, longest)}."
+        lines.append(line)
+    return "\n\n".join(lines)
+
+
 def head(columns: str) -> list[str]:
     names = columns.split("|")
     return ["| " + " | ".join(names) + " |", "| " + " | ".join("---" for _ in names) + " |"]
@@ -146,6 +162,8 @@ def draw_sizes(found: list[Row], out: Path) -> None:
         axes.grid(alpha=0.25)
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
+    every[0].yaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
+    every[0].yaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
     every[0].set_ylabel("ms of both cores, a step of a seed")
     if every[1].lines:
         every[1].legend(frameon=False)
@@ -200,7 +218,7 @@ def pages(root: Path) -> dict[str, str]:
         return {}
     draw_sizes(found, root / "docs" / "img" / "performance-sizes.png")
     return {
-        "speed-compared": compared(found) + "\n\n" + provenance(found),
+        "speed-compared": "\n\n".join(x for x in (compared(found), behind(found), provenance(found)) if x),
         "speed-resources": resources(found),
         "speed-parts": parts(found),
         "speed-floors": floors(found),
