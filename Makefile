@@ -1,4 +1,4 @@
-.PHONY: sync check test test-all docs
+.PHONY: sync check test test-all docs bench
 
 sync:      ## install the package and everything for development
 	pip install -e '.[dev]'
@@ -16,3 +16,12 @@ test-all:  ## with the tests that train for minutes
 
 docs:      ## build the documentation; a broken link is an error
 	mkdocs build --strict
+
+# peers are measured where they are: benchmarks/speed/README.md
+PEERS = $(if $(wildcard peers/VDPO),--vdpo peers/VDPO) $(if $(wildcard peers/cleanrl),--cleanrl peers/cleanrl) \
+	$(if $(wildcard .venv-torch),--torch-python .venv-torch/bin/python) \
+	$(if $(wildcard .venv-sbx),--jax-python .venv-sbx/bin/python)
+
+bench:     ## speed beside the peers, alternating; BENCH='vdpo-64 --threads 1' chooses
+	python benchmarks/speed/run.py $(PEERS) $(BENCH)
+	python benchmarks/figures.py

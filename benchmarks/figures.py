@@ -11,6 +11,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
+from speed import tables as speed
 
 HERE = Path(__file__).parent
 COLOURS = {
@@ -247,6 +248,8 @@ def main() -> None:
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
+    for key, text in speed.pages(root).items():
+        insert(root / "docs" / "performance.md", key, text)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,217 @@
+"""What an update costs at least, and where its time goes: `python floor.py SIDE` prints one JSON object.
+
+The floor of a training step is its matrix products' arithmetic at the best rate at which this machine multiplies
+matrices. Parts are timed one by one, each waited for; in training they overlap, so their sum may exceed a step.
+"""
+
+import json
+import math
+import resource
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gate import pin
+
+from delayrl import replay as ring
+from delayrl.acting import Actor
+from delayrl.agents import AGENTS
+from delayrl.agents.base import Phase
+from delayrl.config import override
+from delayrl.delays import Delay
+from delayrl.envs import delay_of, make
+from delayrl.policy import spec_of
+from delayrl.training import on_device
+from delayrl.types import Transition
+
+ROWS = 2_000
+"""Rows of the replay that the parts are timed on; reading it costs the same at any size that exceeds the caches."""
+
+
+def matmul_flops(function: Callable[..., Any], *args: Any) -> float:
+    """Multiplications and additions of all matrix products of a function on arguments of these shapes.
+
+    Loops count as often as they run. Of a branch the mean counts: SAC's actor learns in every second update.
+    """
+    return _products(jax.make_jaxpr(function)(*args).jaxpr)
+
+
+def _products(jaxpr: Any) -> float:
+    total = 0.0
+    for equation in jaxpr.eqns:
+        name, params = equation.primitive.name, equation.params
+        if name == "dot_general":
+            (contracted, _), _ = params["dimension_numbers"]
+            inner = math.prod(equation.invars[0].aval.shape[axis] for axis in contracted)
+            total += 2 * inner * math.prod(equation.outvars[0].aval.shape)
+        elif name == "cond":
+            branches = [_products(branch.jaxpr) for branch in params["branches"]]
+            total += sum(branches) / len(branches)
+        elif name == "while":
+            raise NotImplementedError("a loop of unknown length; write it as a scan")
+        else:
+            inside = sum(_products(x) for value in params.values() for x in _jaxprs(value))
+            total += inside * (params["length"] if name == "scan" else 1)
+    return total
+
+
+def _jaxprs(value: Any) -> list[Any]:
+    if hasattr(value, "eqns"):
+        return [value]
+    if hasattr(value, "jaxpr"):
+        return [value.jaxpr]
+    return [x for item in value for x in _jaxprs(item)] if isinstance(value, tuple | list) else []
+
+
+def amortised(phases: list[tuple[int, int, float]]) -> float:
+    """What one environment step costs: of phases (every so many steps, so many updates, the cost of one update)."""
+    return sum(updates * cost / every for every, updates, cost in phases)
+
+
+def median_seconds(function: Callable[[], Any], seconds: float = 0.6, least: int = 5) -> float:
+    """Of one call, waited for."""
+    jax.block_until_ready(function())
+    times: list[float] = []
+    until = time.perf_counter() + seconds
+    while len(times) < least or (time.perf_counter() < until and len(times) < 1000):
+        began = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - began)
+    return float(np.median(times))
+
+
+def rate(left: tuple[int, int], right: tuple[int, int], transposed: str = "", seconds: float = 0.5) -> float:
+    """The best rate of a product, in operations a second: the best, because others may use the machine too."""
+    a, b = jnp.ones(left), jnp.ones(right)
+    products = {"": lambda a, b: a @ b, "left": lambda a, b: a.T @ b, "right": lambda a, b: a @ b.T}
+    multiply = jax.jit(products[transposed])
+    size = multiply(a, b).size * 2 * (left[0] if transposed == "left" else left[1])
+    multiply(a, b).block_until_ready()
+    best, until = math.inf, time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        began = time.perf_counter()
+        multiply(a, b).block_until_ready()
+        best = min(best, time.perf_counter() - began)
+    return size / best
+
+
+def rates(rows: int, width: int) -> dict[str, float]:
+    """Of squares; and forward, for the weights' gradient and for the inputs', in a square layer of an update."""
+    x, w = (rows, width), (width, width)
+    return {
+        "square": max(rate((size, size), (size, size)) for size in (512, 1024, 2048)),
+        "forward": rate(x, w),
+        "weights": rate(x, x, "left"),
+        "inputs": rate(x, w, "right"),
+    }
+
+
+def filled(spec: Any, rows: int) -> ring.Replay:
+    """A replay with episodes of 1,000 random steps in it."""
+    random = np.random.default_rng(0)
+    number = np.arange(rows)
+    moment = number % 1000
+
+    def noise(*shape: int) -> jax.Array:
+        return jnp.asarray(random.standard_normal((rows, *shape), np.float32))
+
+    steps = Transition(
+        noise(spec.obs_size),
+        jnp.minimum(moment, spec.delay),
+        jnp.tanh(noise(spec.action_size)),
+        noise(),
+        jnp.zeros(rows, bool),
+        jnp.asarray(moment == 999),
+        noise(spec.obs_size),
+        jnp.minimum(moment + 1, spec.delay),
+    )
+    empty = ring.init(spec, rows + rows // 1000 + 2)
+    return jax.jit(lambda: jax.lax.scan(lambda r, step: (ring.append(r, step), None), empty, steps)[0])()
+
+
+def parts(side: dict[str, Any]) -> dict[str, Any]:
+    """Seconds of each part of a training step of all seeds, matmul operations of a seed's step, bytes of its replay."""
+    preset = AGENTS[side["agent"]].presets[side["preset"]]
+    agent = override(preset.agent, side["options"])
+    delay: Delay = delay_of(side["env"], side["delay"])
+    actor = Actor(make(side["env"], delay.observed(), rescale=True), 0, agent.privileged)
+    actor.reset()
+    spec, seeds = spec_of(actor.env), side["seeds"]
+    keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+    state = jax.jit(jax.vmap(partial(agent.init, spec)))(keys)
+    one = filled(spec, ROWS)
+    replay = jax.tree.map(lambda x: jnp.stack([x] * seeds), one)
+    seen = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * seeds), actor.seen)
+
+    act = jax.jit(jax.vmap(partial(agent.act, explore=True)))
+    found = {"act": median_seconds(lambda: np.asarray(act(state, seen, keys)))}
+    random = np.random.default_rng(0)
+    found["environment"] = seeds * median_seconds(
+        lambda: actor.step(random.uniform(-1, 1, spec.action_size).astype(np.float32))
+    )
+    flops = matmul_flops(partial(agent.act, explore=True), *jax.tree.map(lambda x: x[0], (state, seen)), keys[0])
+    costs = []
+    for index, phase in enumerate(agent.phases()):
+        reach = (phase.batch, spec.delay, agent.ahead(spec))
+        seconds = update_seconds(phase, reach, state, replay, keys)
+        found[f"phase {index}"] = amortised([(phase.every, phase.updates, seconds)])
+        batch = jax.eval_shape(partial(windows, reach), one, keys[0])
+        single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
+        cost = matmul_flops(phase.update, single, batch, keys[0], jax.ShapeDtypeStruct((), jnp.int32))
+        costs.append((phase.every, phase.updates, cost))
+    flops += amortised(costs)
+    rows = phase.batch * max(spec.delay, 1)
+    capacity = side.get("capacity", 1_000_000)
+    return {
+        "parts": found,
+        "flops": flops,
+        "rates": rates(rows, getattr(agent, "width", 256)),
+        "obs_size": spec.obs_size,
+        "replay_bytes": replay_bytes(spec, capacity),
+        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def windows(reach: tuple[int, int, int], replay: ring.Replay, key: Any) -> Any:
+    """A batch of one seed."""
+    return ring.sample(replay, key, *reach, jnp.int32(0))
+
+
+def update_seconds(phase: Phase, reach: tuple[int, int, int], state: Any, replay: ring.Replay, keys: Any) -> float:
+    """Of one update of all seeds, sampling included: the mean over both of SAC's turns, or over a short round."""
+    count = 2 if phase.updates == 1 else 20
+
+    def one(state: Any, replay: ring.Replay, key: Any, i: Any) -> Any:
+        draw, learn = jax.random.split(jax.random.fold_in(key, i))
+        return phase.update(state, windows(reach, replay, draw), learn, i)[0]
+
+    @jax.jit
+    def several(state: Any, replay: ring.Replay, keys: Any) -> Any:
+        def update(state: Any, i: Any) -> Any:
+            return jax.vmap(one, in_axes=(0, 0, 0, None))(state, replay, keys, i), None
+
+        return jax.lax.scan(update, state, jnp.arange(count))[0]
+
+    return median_seconds(partial(several, state, replay, keys)) / count
+
+
+def replay_bytes(spec: Any, capacity: int) -> int:
+    """Of one seed's replay."""
+    shapes = jax.eval_shape(lambda: ring.init(spec, capacity))
+    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(shapes))
+
+
+def main() -> None:
+    pin()
+    side = json.loads(sys.argv[1])
+    with on_device(side["device"]):
+        print(json.dumps(parts(side)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""What is measured: the same work on two sides, and our cost against size."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Work:
+    """A name, words for the table, environment steps of a slice on each device, and the sides: ours and a peer.
+
+    A side is a JSON object: `kind` (a function of worker.py), `env`, `delay`, `seeds`, `options`; ours also `agent`
+    and `preset`.
+    """
+
+    name: str
+    title: str
+    steps: dict[str, int]
+    sides: dict[str, dict[str, Any]]
+
+
+def ours(agent: str, preset: str = "paper", delay: int = 0, seeds: int = 1, env: str = "", **options: Any) -> Any:
+    fixed = {"kind": "ours", "agent": agent, "preset": preset, "delay": delay, "seeds": seeds}
+    return fixed | {"env": env or CHEETAH, "options": options}
+
+
+def peer(kind: str, delay: int = 0, **options: Any) -> dict[str, Any]:
+    return {"kind": kind, "env": CHEETAH, "delay": delay, "options": options}
+
+
+CHEETAH = "HalfCheetah-v5"
+_LOCKSTEP = {"ours": ours("vdpo", "small", 5, seeds=4), "peer": ours("vdpo", "small", 5)}
+
+
+def _vdpo(delay: int) -> dict[str, Any]:
+    return {"ours": ours("vdpo", delay=delay), "peer": peer("vdpo", delay)}
+
+
+def _sac(kind: str) -> Work:
+    names = {"sbx": "SBX", "sb3": "Stable-Baselines3", "cleanrl": "CleanRL"}
+    title = f"SAC, 256 × 256, batch 256, HalfCheetah-v5; {names[kind]}"
+    return Work(f"sac-{kind}", title, {"cpu": 100}, {"ours": ours("sac"), "peer": peer(kind)})
+
+
+WORKS = {
+    work.name: work
+    for work in (
+        Work(
+            "vdpo-64",
+            "VDPO, width 64, batch 128, HalfCheetah-v5, Δ = 5; released code",
+            {"cpu": 20},
+            {
+                "ours": ours("vdpo", delay=5, width=64, batch_size=128),
+                "peer": peer("vdpo", 5, embedding_dim=64, batch_size=128),
+            },
+        ),
+        _sac("sb3"),
+        _sac("sbx"),
+        Work("lockstep", "VDPO, preset `small`, Δ = 5: 4 seeds in lockstep; one after another", {"cpu": 50}, _LOCKSTEP),
+        Work(
+            "vdpo-5",
+            "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5; released code",
+            {"cpu": 10, "gpu": 1000},
+            _vdpo(5),
+        ),
+        Work(
+            "vdpo-5-ten",
+            "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5, ten seeds in lockstep; released code, one seed",
+            {"gpu": 1000},
+            _vdpo(5) | {"ours": ours("vdpo", delay=5, seeds=10)},
+        ),
+        _sac("cleanrl"),
+        Work("vdpo-25", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 25; released code", {"cpu": 10}, _vdpo(25)),
+    )
+}
+
+
+def _size(preset: str, env: str, delay: int, seeds: int, steps: int) -> Work:
+    name = f"size-{preset}-{env}-{delay}-{seeds}"
+    title = f"VDPO, preset `{preset}`, {env}, Δ = {delay}, {seeds} seed{'s' * (seeds > 1)}"
+    return Work(name, title, {"cpu": steps}, {"ours": ours("vdpo", preset, delay, seeds, env)})
+
+
+SIZES = {
+    work.name: work
+    for work in (
+        *(_size("small", CHEETAH, 5, seeds, 100 // seeds) for seeds in (1, 2, 4, 8)),
+        *(_size("small", CHEETAH, delay, 1, 40) for delay in (25, 50)),
+        *(_size("small", env, 5, 1, 50) for env in ("InvertedPendulum-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5")),
+        *(_size("paper", CHEETAH, delay, 1, 10) for delay in (5, 25, 50)),
+        _size("paper", "Humanoid-v5", 50, 1, 10),
+    )
+}

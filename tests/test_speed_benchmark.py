@@ -1,0 +1,154 @@
+"""The arithmetic of the speed benchmark, and its protocol with a side that does not learn."""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "speed")]
+
+import floor  # noqa: E402
+import run  # noqa: E402
+from speed import tables  # noqa: E402
+from works import SIZES, WORKS, Work  # noqa: E402
+
+from delayrl import replay as ring  # noqa: E402
+from delayrl.agents.sac import SAC  # noqa: E402
+from delayrl.types import Spec  # noqa: E402
+
+DUMMY = {"kind": "dummy", "env": "InvertedPendulum-v5", "delay": 0, "seeds": 1, "device": "cpu", "options": {}}
+
+
+def test_products_are_counted_by_hand() -> None:
+    """Two layers of 8 → 16 → 4 at 32 rows: forward, both weights' gradients, and the one inner inputs' gradient."""
+    w1, w2, x = jnp.ones((8, 16)), jnp.ones((16, 4)), jnp.ones((32, 8))
+
+    def loss(w: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return ((jax.nn.relu(x @ w[0]) @ w[1]) ** 2).sum()
+
+    first, second = 2 * 32 * 8 * 16, 2 * 32 * 16 * 4
+    assert floor.matmul_flops(loss, (w1, w2)) == first + second
+    assert floor.matmul_flops(jax.grad(loss), (w1, w2)) == 2 * first + 3 * second
+
+    def often(w: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return jax.lax.scan(lambda total, _: (total + loss(w), None), 0.0, None, length=7)[0]
+
+    assert floor.matmul_flops(often, (w1, w2)) == 7 * (first + second)
+    every_second = lambda i: jax.lax.cond(i % 2 == 0, lambda: loss((w1, w2)), lambda: 0.0)  # noqa: E731
+    assert floor.matmul_flops(every_second, jnp.int32(0)) == (first + second) / 2
+    assert floor.matmul_flops(jax.vmap(lambda a: a @ w1), jnp.ones((5, 3, 8))) == 5 * 2 * 3 * 8 * 16
+
+
+def test_products_agree_with_xla() -> None:
+    """On products alone, batched ones too, our count is that of XLA's cost analysis."""
+    a, b = jnp.ones((6, 32, 64)), jnp.ones((6, 64, 16))
+    function = lambda a, b: jnp.einsum("bij,bjk->bik", a, b)  # noqa: E731
+    assert floor.matmul_flops(function, a, b) == jax.jit(function).lower(a, b).cost_analysis()["flops"]
+
+
+def test_products_of_sac() -> None:
+    """One critic update: twin targets forward, twin critics forward and back; every second time the actor, twice."""
+    agent, spec, batch = SAC(hidden=(64, 64), batch_size=32), Spec(10, 3, 0), 32
+    replay = jax.eval_shape(lambda: ring.init(spec, 100))
+    key, number = jax.random.key(0), jnp.int32(0)
+    windows = jax.eval_shape(lambda r: ring.sample(r, key, batch, 0, 3, number), replay)
+    state = jax.eval_shape(lambda: agent.init(spec, key))
+    actor, hidden, critic = 2 * batch * 10 * 64, 2 * batch * 64 * 64, 2 * batch * 13 * 64
+    policy, value = actor + hidden + 2 * batch * 64 * 6, critic + hidden + 2 * batch * 64
+    back = lambda forward, first: 2 * forward - first  # noqa: E731  # no gradient of the data
+    learn = policy + 2 * value + 2 * (value + back(value, critic))
+    # the critics' weights stand still: only the gradient of their inputs
+    improve = policy + 2 * value + 2 * value + back(policy, actor) + policy
+    counted = floor.matmul_flops(agent.update, state, windows, key, number)
+    assert counted == pytest.approx(learn + 0.5 * 2 * improve, rel=0.02)
+
+
+def test_amortised() -> None:
+    """A thousand updates every thousand steps cost one each step."""
+    assert floor.amortised([(1, 1, 0.01), (1000, 1000, 0.02)]) == pytest.approx(0.03)
+    assert floor.amortised([(1, 2, 0.01), (250, 500, 0.02)]) == pytest.approx(0.06)
+
+
+def test_replay_bytes() -> None:
+    """The table's formula is what our replay takes; the released code's is counted by its columns."""
+    for sizes in ((17, 6, 5), (348, 17, 50)):
+        ours, _ = tables.replay(*sizes, 1000)
+        assert abs(floor.replay_bytes(Spec(*sizes), 1000) - ours) < 100
+    _, theirs = tables.replay(2, 1, 3, 1)
+    assert theirs == 4 * (2 + 1 + 1 + 2 + 1 + 1) + 4 * (2 + 3 * 1 + 3 * 2) + 3 * (8 + 1)
+
+
+def test_ratios_pair_slices() -> None:
+    """Each slice with the one beside it; of one environment step of one seed."""
+    ours = [{"seconds": s, "processor": s / 2} for s in (1.0, 2.0, 4.0)]
+    peer = [{"seconds": s, "processor": s} for s in (3.0, 4.0, 4.0)]
+    found = run.ratios(ours, peer, 1, 1)
+    assert found["ratio"]["median"] == 2
+    assert found["processor_ratio"]["median"] == 4
+    assert run.ratios(ours, peer, 4, 1)["ratio"]["median"] == 8
+    assert run.quartiles([4, 1, 3, 2, 5]) == {"median": 3, "low": 2, "high": 4}
+
+
+def test_protocol() -> None:
+    """A side starts, runs exactly the slices that it is asked for, and stops."""
+    side = run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 10}, threads=1)
+    try:
+        assert {"gymnasium", "mujoco"} <= side.hello["packages"].keys()
+        short, long = side.slice(20), side.slice(4000)
+    finally:
+        side.close()
+    assert 0 < short["seconds"] < long["seconds"]
+    assert long["processor"] <= 1.2 * long["seconds"]
+    assert long["peak_bytes"] > 1e6
+    assert side._process.returncode == 0
+
+
+def test_a_side_that_fails_says_why() -> None:
+    with pytest.raises(run.MeasurementError, match=r"dummy cannot be measured: .*Nonsense"):
+        run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1, "env": "Nonsense-v0"}, threads=1)
+
+
+def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
+    names = list(WORKS)
+    row = {"work": names[1], "device": "cpu", "threads": 2, "value": 1}
+    for more in ({}, {"work": names[0]}, {"value": 2}, {"device": "gpu"}):
+        run.write(row | more, tmp_path / "rows.jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
+    assert [(x["work"], x["device"], x["value"]) for x in lines] == [
+        (names[0], "cpu", 1),
+        (names[1], "cpu", 2),
+        (names[1], "gpu", 1),
+    ]
+
+
+def test_both_sides_clone_once_a_slice() -> None:
+    """One KL update a step, whatever the slice's length: the papers' schedule."""
+    work: Work = WORKS["vdpo-64"]
+    sys_argv, sys.argv = sys.argv, ["run.py", "--vdpo", str(BENCHMARKS)]
+    try:
+        args = run.arguments()
+    finally:
+        sys.argv = sys_argv
+    sides = {role: run.complete(side, work, 20, args) for role, side in work.sides.items()}
+    assert sides["ours"]["options"]["clone_every"] == sides["ours"]["options"]["clone_updates"] == 20
+    assert sides["peer"]["options"]["kl_freq"] == 20
+    assert sides["peer"]["options"]["embedding_dim"] == sides["ours"]["options"]["width"]
+    assert len(SIZES) > 10
+
+
+def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
+    """Every row shows, what was not run is empty, and where the peer is faster it is said."""
+    rows = tables.rows()
+    assert rows
+    works = [row for row in rows if not row["work"].startswith("size-")]
+    assert tables.compared(rows).count("\n") == len(works) + 1
+    assert tables.sizes(rows).count("\n") == len(SIZES) + 1
+    slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
+    assert "ratio 0.50" in tables.behind([slow])
+    assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
+    tables.draw_sizes(rows, tmp_path / "sizes.png")
+    assert (tmp_path / "sizes.png").stat().st_size > 5000
