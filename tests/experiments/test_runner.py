@@ -35,12 +35,12 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[
     return file, home / "runs"
 
 
-def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int) -> int:
-    """Run a grid, killing workers at random; how many were killed."""
+def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int, within: float) -> int:
+    """Run a grid, killing workers at random, some seconds apart; how many were killed."""
     cells, rng, killed = load_grid(file).cells, random.Random(kills), 0
     process = bench("run", file, "--runs", runs, "--workers", workers, "--tries", kills + 1, cache=cache)
     try:
-        next_kill = time.monotonic() + rng.uniform(0, 8)
+        next_kill = time.monotonic() + rng.uniform(0, within)
         while process.poll() is None:
             time.sleep(0.05)
             busy = [pid for cell in cells if (pid := worker_of(runs / cell.folder))]
@@ -48,7 +48,7 @@ def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int) -> int:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(rng.choice(busy), signal.SIGKILL)
                     killed += 1
-                next_kill = time.monotonic() + rng.uniform(0, 8)
+                next_kill = time.monotonic() + rng.uniform(0, within)
         finish(process)
     finally:
         process.kill()
@@ -65,7 +65,7 @@ def ends(runs: Path, file: Path) -> list[int]:
 def test_workers_killed(undisturbed, tmp_path: Path, cache: Path) -> None:
     """Every cell ends once, no row is lost or double, results are those of the undisturbed grid."""
     file, expected = undisturbed
-    assert chaos(file, tmp_path / "runs", cache, kills=2, workers=2) == 2
+    assert chaos(file, tmp_path / "runs", cache, kills=2, workers=2, within=1) == 2
     assert_same_results(file, tmp_path / "runs", expected)
     assert ends(tmp_path / "runs", file) == [1, 1]
 
@@ -74,7 +74,7 @@ def test_workers_killed(undisturbed, tmp_path: Path, cache: Path) -> None:
 def test_workers_killed_twenty_times(tmp_path: Path, cache: Path) -> None:
     file = tiny(tmp_path, steps=3000)
     finish(bench("run", file, "--runs", tmp_path / "expected", cache=cache))
-    assert chaos(file, tmp_path / "runs", cache, kills=20, workers=2) == 20
+    assert chaos(file, tmp_path / "runs", cache, kills=20, workers=2, within=8) == 20
     assert_same_results(file, tmp_path / "runs", tmp_path / "expected")
     assert ends(tmp_path / "runs", file) == [1, 1]
 
