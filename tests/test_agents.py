@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from conftest import TINY, TINY_SAC, record
+from delayrl import networks
 from delayrl import replay as ring
 from delayrl.agents import AGENTS
 from delayrl.agents.random import Random
-from delayrl.agents.vdpo import VDPO, unseen
+from delayrl.agents.vdpo import VDPO, Unseen, unseen
 from delayrl.errors import DelayRLError
 from delayrl.learning import Program
 from delayrl.types import Seen, Spec, Transition
@@ -127,6 +128,76 @@ def test_lockstep_seeds_are_seeds_alone(name: str) -> None:
         alone = run([seed])
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[seed], b[0], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["bpql", "vdpo"])
+def test_a_block_of_steps_is_its_steps(name: str) -> None:
+    """Five steps learned from in one call, and one by one; the rarer phase is due at the block's end."""
+    agent, data = TINY[name], record(ENV, 3, 90)[0]
+    program = program_of(agent, 3)
+    keys = jax.vmap(jax.random.key)(jnp.arange(1))
+    ends = []
+    for block in (1, 5):
+        learner, pending, due = program.init(keys, 100), [], []
+        for step, transition in enumerate(data, 1):
+            pending.append((jax.tree.map(lambda x: np.asarray(x)[None], transition), np.full(1, step % 3, np.int32)))
+            due.append(tuple(i for i, p in enumerate(program.phases) if step > 60 and step % p.every == 0))
+            if block == 1:
+                learner, metrics = program.learn(learner, *pending[0], keys, step, due[0])
+            elif step % block == 0:
+                learner, metrics = program.learn_block(learner, pending, keys, range(step - 4, step + 1), due)
+            pending, due = ([], []) if step % block == 0 else (pending, due)
+        ends.append((learner, metrics))
+    assert set(ends[0][1]) <= set(ends[1][1])
+    for a, b in zip(jax.tree.leaves(ends[0][0]), jax.tree.leaves(ends[1][0]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+@pytest.mark.parametrize("block", [1, 4])
+def test_learning_copies_no_replay(seeds: int, block: int) -> None:
+    """What the compiled step needs beside its arguments does not grow with the replay, which is updated in place."""
+    program = program_of(TINY["bpql"], 3)
+    keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+    transition = jax.tree.map(lambda x: np.stack([x] * seeds), record(ENV, 3, 1)[0][0])
+    hidden, step = np.zeros(seeds, np.int32), np.int32(100)
+    learn, arguments = program._jitted_learn, (transition, hidden, keys, step)
+    if block > 1:
+        learn = program._jitted_block
+        arguments = (*jax.tree.map(lambda x: np.stack([x] * block), (transition, hidden)), keys, np.full(block, step))
+    needed = []
+    for capacity in (200, 100_000):
+        learner = jax.eval_shape(lambda capacity=capacity: program.init(keys, capacity))
+        compiled = learn.lower(learner, *arguments, index=0).compile({"xla_backend_optimization_level": 3})
+        needed.append(compiled.memory_analysis().temp_size_in_bytes)
+    assert needed[0] == needed[1]
+
+
+def test_bfloat16_products_are_close(monkeypatch) -> None:
+    """`precision = bfloat16` rounds the inputs of products: what it does to a belief loss and its gradient."""
+    agent = VDPO(TINY_SAC, width=64, layers=3, dropout=0.0)
+    state = agent.init(Spec(OBS, ACT, 5), jax.random.key(0))
+    draw = jax.random.normal(jax.random.key(1), (64, OBS + 5 * ACT + 5 * OBS))
+    obs, actions, states = jnp.split(draw, [OBS, OBS + 5 * ACT], 1)
+    x = Unseen(obs, actions.reshape(64, 5, ACT), states.reshape(64, 5, OBS), jnp.ones((64, 5), bool))
+
+    def evaluated():
+        loss = jax.value_and_grad(agent.belief_loss, has_aux=True)
+        (value, _), gradient = loss((state.encoder, state.decoder), x, jax.random.key(0))
+        return float(value), np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient)])
+
+    value, gradient = evaluated()
+    exact = networks.linear
+    rounded = lambda x: x.astype(jnp.bfloat16).astype(jnp.float32)  # noqa: E731
+    for module in ("networks", "transformer"):
+        monkeypatch.setattr(
+            f"delayrl.{module}.linear",
+            lambda params, x: exact({"w": rounded(params["w"]), "b": params["b"]}, rounded(x)),
+        )
+    coarse_value, coarse = evaluated()
+    error = np.linalg.norm(coarse - gradient) / np.linalg.norm(gradient)
+    assert 0 < error < 0.02
+    assert abs(coarse_value / value - 1) < 1e-3
 
 
 @pytest.mark.parametrize("name", DELAYED)

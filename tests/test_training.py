@@ -169,9 +169,11 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
     assert not (run.path / "replay").exists()
 
 
-def test_stopped_between_checkpoints_and_resumed(tmp_path: Path, monkeypatch) -> None:
-    """A run that is asked to stop keeps its newest step and goes on with it, bit for bit."""
-    whole = train("bpql", tmp_path / "whole")
+@pytest.mark.parametrize(("agent", "block"), [("bpql", 1), ("bpql", 4), ("vdpo", 10)])
+def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_path: Path, monkeypatch) -> None:
+    """A run that is asked to stop keeps its newest steps and goes on with them, bit for bit."""
+    values = {"updates_per_call": block}
+    whole = train(agent, tmp_path / "whole", **values)
     step, calls = Actor.step, 0
 
     def interrupted(self, action):
@@ -183,12 +185,29 @@ def test_stopped_between_checkpoints_and_resumed(tmp_path: Path, monkeypatch) ->
 
     monkeypatch.setattr(Actor, "step", interrupted)
     with pytest.raises(delayrl.DelayRLError, match="stopped at step 157"):
-        train("bpql", tmp_path / "cut")
-    assert "pending.obs" in Run(tmp_path / "cut").latest().arrays("loop")
-    resumed = train("bpql", tmp_path / "cut")
+        train(agent, tmp_path / "cut", **values)
+    assert len(Run(tmp_path / "cut").latest().arrays("loop")["pending.obs"]) == (157 - 1) % block + 1
+    resumed = train(agent, tmp_path / "cut", **values)
     assert resumed.read("rows") == whole.read("rows")
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
+
+
+def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
+    with pytest.raises(delayrl.DelayRLError, match="multiple of updates_per_call; got 100 and 7"):
+        train("bpql", tmp_path / "run", updates_per_call=7)
+
+
+def test_runs_from_before_an_option_go_on(tmp_path: Path) -> None:
+    """A schedule that says nothing of an option means its default."""
+    run = train("random", tmp_path / "run")
+    stored = json.loads((run.path / "config.json").read_text())
+    for name in ("updates_per_call", "precision"):
+        del stored["schedule"][name]
+    (run.path / "config.json").write_text(json.dumps(stored))
+    assert train("random", tmp_path / "run").read("rows") == run.read("rows")
+    with pytest.raises(delayrl.DelayRLError, match="another updates_per_call"):
+        train("random", tmp_path / "run", updates_per_call=2)
 
 
 def test_overwrite_touches_only_runs(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ class Program:
         self.phases, self._agent, self._spec, self._whole = agent.phases(), agent, spec, whole
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="index", donate_argnums=0)
+        self._jitted_block = jax.jit(self._learn_block, static_argnames="index", donate_argnums=0)
 
     def init(self, keys: Key, capacity: int) -> Learner:
         """Fresh states and empty replays."""
@@ -57,6 +58,29 @@ class Program:
         for index in due or (None,):  # the first call stores the step too: one call in an ordinary step
             learner, more = self._jitted_learn(learner, new, hidden, keys, np.int32(step), index=index)
             new, metrics = None, metrics | more
+        return learner, metrics
+
+    def learn_block(
+        self,
+        learner: Learner,
+        pending: list[tuple[Transition, NDArray[np.int32]]],
+        keys: Key,
+        steps: range,
+        due: list[tuple[int, ...]],
+    ) -> tuple[Learner, Metrics]:
+        """`learn` for several steps (each with its `hidden`) in one call.
+
+        The first phase, where it is due at all of the steps, runs after each is stored, as ever; others after the last.
+        """
+        transitions, hidden = jax.tree.map(lambda *x: np.stack(x), *pending)
+        index = 0 if all(0 in phases for phases in due) else None
+        learner, metrics = self._jitted_block(
+            learner, transitions, hidden, keys, np.array(steps, np.int32), index=index
+        )
+        for step, phases in zip(steps, due, strict=True):
+            for rare in [phase for phase in phases if phase != index]:
+                learner, more = self._jitted_learn(learner, None, hidden[-1], keys, np.int32(step), index=rare)
+                metrics = metrics | more
         return learner, metrics
 
     def due(self, step: int, schedule: Schedule) -> tuple[int, ...]:
@@ -107,6 +131,22 @@ class Program:
             agent, metrics = jax.lax.scan(update, agent, jnp.arange(phase.updates))
             metrics = jax.tree.map(lambda x: x.mean(0), metrics)
         return Learner(agent, replay), metrics
+
+    def _learn_block(
+        self,
+        learner: Learner,
+        transitions: Transition,
+        hidden: Int[Array, "block seeds"],
+        keys: Key,
+        steps: Int[Array, " block"],
+        index: int | None,
+    ) -> tuple[Learner, Metrics]:
+        def one(learner: Learner, x: tuple[Transition, Array, Array]) -> tuple[Learner, Metrics]:
+            transition, hidden, step = x
+            return self._learn(learner, transition, hidden, keys, step, index)
+
+        learner, metrics = jax.lax.scan(one, learner, (transitions, hidden, steps))
+        return learner, jax.tree.map(lambda x: x.mean(0), metrics)
 
 
 compiled = functools.cache(Program)

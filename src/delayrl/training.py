@@ -103,7 +103,7 @@ def train(
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
-    with on_device(device):
+    with on_device(device), jax.default_matmul_precision(schedule.precision):
         official = protocol == "official"
         whole = config.ahead if official and find_agent(agent).drops_last_starts else None
         session = Session(config, schedule, env, late, [seed + i for i in range(seeds)], official, whole)
@@ -146,7 +146,8 @@ class Session:
         self.program = compiled(agent, self.spec, whole(self.spec) if whole else 1)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step, self.learning = 0, False
-        self.pending: Transition | None = None  # the newest step, which the learners have not been given yet
+        # the newest steps, which the learners have not been given yet, and what `_hidden` said after each
+        self.pending: list[tuple[Transition, NDArray[np.int32]]] = []
         self.chosen: Any = None  # the next actions, where they have been chosen already
         self.stored: list[dict[str, str]] = [{} for _ in seeds]
         self.stored_until = [(0, 0) for _ in seeds]  # rows and steps of the replay that are in its pieces
@@ -198,7 +199,8 @@ class Session:
         have = run.config
         for key, value in wanted.items():
             if isinstance(value, dict):
-                changed = [k for k in value if have[key].get(k) != value[k]]
+                unsaid = values_of(Schedule()) if key == "schedule" else {}
+                changed = [k for k in value if have[key].get(k, unsaid.get(k)) != value[k]]
             else:
                 changed = [key] if have.get(key) != value else []
             if changed:
@@ -214,7 +216,7 @@ class Session:
         )
         if checkpoints[0].complete:
             return
-        replays, pending, chosen = [], [], []
+        replays, pending, hidden, chosen = [], [], [], []
         for i, (run, checkpoint) in enumerate(zip(self.runs, checkpoints, strict=True)):
             loop = checkpoint.arrays("loop")
             columns = {name: np.array(column[i]) for name, column in self.learner.replay._asdict().items()}
@@ -224,14 +226,17 @@ class Session:
                 columns[name] = loop[name]
             replays.append(ring.Replay(**columns))  # type: ignore[arg-type]
             self.stored[i], self.stored_until[i] = dict(checkpoint.pieces), (int(loop["rows"]), int(loop["steps"]))
-            kept = {name: loop[f"pending.{name}"] for name in Transition._fields if f"pending.{name}" in loop}
-            pending += [Transition(**kept)] if kept else []  # type: ignore[arg-type]
+            kept = [loop[f"pending.{name}"] for name in Transition._fields if f"pending.{name}" in loop]
+            pending += [Transition(*kept)] if kept else []  # type: ignore[arg-type]
+            hidden += [loop["hidden"]] if kept else []
             chosen += [loop["chosen"]] if "chosen" in loop else []
             self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
             if not np.array_equal(self.actors[i].truth, loop["truth"]):
                 raise DelayRLError(f"{self.env} does not repeat an episode from its seed, so the run cannot be resumed")
         self.learner = self.learner._replace(replay=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays))
-        self.pending = jax.tree.map(lambda *x: np.stack(x), *pending) if pending else None
+        for j in range(len(hidden[0]) if hidden else 0):
+            step = jax.tree.map(lambda *x, j=j: np.stack([y[j] for y in x]), *pending)
+            self.pending.append((step, np.array([count[j] for count in hidden], np.int32)))
         self.chosen = np.stack(chosen) if chosen else None
 
     def save(self, *, complete: bool = False) -> None:
@@ -255,8 +260,12 @@ class Session:
             self.stored_until[i] = rows, steps
             alive = rows - self.schedule.replay_capacity
             self.stored[i] = {n: d for n, d in self.stored[i].items() if int(n[13:25]) > alive}
-            pending = {} if self.pending is None else self.pending._asdict()  # there is one where a run was stopped
-            loop: Arrays = {f"pending.{name}": np.asarray(x[i]) for name, x in pending.items()}
+            loop: Arrays = {}
+            if self.pending:  # where a run was stopped
+                steps_left, hidden = zip(*self.pending, strict=True)
+                left = jax.tree.map(lambda *x, i=i: np.stack([y[i] for y in x]), *steps_left)
+                loop = {f"pending.{name}": x for name, x in left._asdict().items()}
+                loop["hidden"] = np.array([count[i] for count in hidden], np.int32)
             loop |= {} if self.chosen is None else {"chosen": np.asarray(self.chosen)[i]}
             counts = {"rows": rows, "steps": steps, "lost": lost, "episode": actor.episode}
             loop |= {n: np.asarray(x, np.int32) for n, x in counts.items()}
@@ -292,10 +301,11 @@ class Session:
         ):
             while self.step < schedule.steps and not stop.is_set():
                 self._choose()
-                metrics |= self._learn()
+                if len(self.pending) == schedule.updates_per_call:
+                    metrics |= self._learn()
                 actions, self.chosen = np.asarray(self.chosen), None
                 steps = [actor.step(action) for actor, action in zip(self.actors, actions, strict=True)]
-                self.pending = jax.tree.map(lambda *x: np.stack(x), *steps)
+                self.pending.append((jax.tree.map(lambda *x: np.stack(x), *steps), self._hidden()))
                 self.step += 1
                 bar.update(1)
                 if self.step % METRICS_EVERY == 0:
@@ -329,16 +339,20 @@ class Session:
             self.chosen = np.where(first, self._random(), self.chosen)
 
     def _learn(self) -> Metrics:
-        """Hand the newest step to the learners, and have them learn what is due. Not waited for."""
-        if self.pending is None:
+        """Hand the newest steps to the learners, and have them learn what is due. Not waited for."""
+        if not self.pending:
             return {}
-        due = self.program.due(self.step, self.schedule)
-        if due and not self.learning:
+        steps = range(self.step - len(self.pending) + 1, self.step + 1)
+        due = [self.program.due(step, self.schedule) for step in steps]
+        if any(due) and not self.learning:
             self.learning = True
             if int(self.learner.replay.steps.min()) < self.spec.delay + 1:
                 raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
-        transition, self.pending = self.pending, None
-        self.learner, new = self.program.learn(self.learner, transition, self._hidden(), self.keys, self.step, due)
+        pending, self.pending = self.pending, []
+        if len(pending) == 1:
+            self.learner, new = self.program.learn(self.learner, *pending[0], self.keys, self.step, due[0])
+        else:
+            self.learner, new = self.program.learn_block(self.learner, pending, self.keys, steps, due)
         return new
 
     def _random(self) -> NDArray[np.float32]:
@@ -451,6 +465,11 @@ def check_fit(agent: Agent, schedule: Schedule, env: Delayed) -> State:
         raise DelayRLError(f"replay_capacity must be at least {least} here; got {schedule.replay_capacity}")
     if schedule.random_steps < least:
         raise DelayRLError(f"random_steps must be at least {least} here; got {schedule.random_steps}")
+    if schedule.evaluate_every % schedule.updates_per_call:  # or evaluating would change what is learned
+        raise DelayRLError(
+            f"evaluate_every must be a multiple of updates_per_call; got {schedule.evaluate_every} and "
+            f"{schedule.updates_per_call}"
+        )
     if task is None or task.max_episode_steps is None:
         name = task.id if task else "the task"
         raise DelayRLError(f"{name} has no time limit, so evaluation may never end; register it with one")

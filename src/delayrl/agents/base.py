@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import optax
@@ -14,6 +14,7 @@ from delayrl.networks import Params
 from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.views import Sees
 
+Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 State = Any
 """An agent's state: a tree of arrays; networks, optimisers, temperatures."""
 
@@ -93,6 +94,8 @@ class Schedule:
     replay_capacity: Annotated[int, "rows of the replay: one a step, and one more an episode"] = 1_000_000
     evaluate_every: Annotated[int, "steps between two evaluations (and checkpoints)"] = 10_000
     evaluation_episodes: Annotated[int, "episodes of each evaluation"] = 10
+    updates_per_call: Annotated[int, "environment steps between two calls to learn, each with all that is due"] = 1
+    precision: Annotated[Precision, "of the products of matrices, where the device has a choice"] = "float32"
 
 
 class Preset(NamedTuple):
