@@ -164,6 +164,8 @@ def test_grids_of_the_paper() -> None:
 
 BAD = [
     ("agents = [", "is no TOML file"),
+    ("product = []", "there are no products, so nothing to run"),
+    (BASIC + "product = []", "there are no products, so nothing to run"),
     ('agent = ["bpql"]\n', "unknown key 'agent' of the grid"),
     (BASIC.replace("bpql", "bqpl"), "unknown agent 'bqpl'; did you mean bpql"),
     (BASIC.replace("Reacher-v5", "Reacher-v9"), "unknown task 'Reacher-v9'"),
@@ -180,6 +182,8 @@ BAD = [
     (BASIC + "[overrides]\nbatch_sise = 3\n", "did you mean batch_size"),
     (BASIC + "[overrides]\nreplay_capacity = 5\n", "replay_capacity must be at least"),
     (BASIC + "[overrides.vpdo]\nwidth = 3\n", "did you mean vdpo"),
+    (BASIC + "[overrides]\nbpql = 3\n[[product]]\n[product.overrides.bpql]\nsteps = 9\n", "a table in one place"),
+    (BASIC + "[overrides.bpql]\nsteps = 9\n[[product]]\n[product.overrides]\nbpql = 3\n", "a table in one place"),
     (BASIC + 'preset = "big"\n', "is no TOML file"),  # twice
     (BASIC.replace("small", "big"), "unknown preset 'big'"),
     (BASIC.replace('"bpql"', '"a-sac"'), "two cells hold the same run"),

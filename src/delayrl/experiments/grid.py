@@ -167,6 +167,8 @@ def _parse(table: dict[str, Any], source: Path, included: bool) -> Grid:
             cells += _cells(merged)
         except DelayRLError as error:
             raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
+    if not cells:
+        raise DelayRLError("there are no products, so nothing to run")
     _check_overlap(cells)
     tasks = {cell.env: i for i, cell in reversed(list(enumerate(cells)))}
     cells.sort(key=lambda cell: tasks[cell.env])  # a task is finished before the next one begins
@@ -187,7 +189,10 @@ def _merge(*tables: Mapping[str, Any]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for table in tables:
         for key, value in table.items():
-            merged[key] = {**merged.get(key, {}), **value} if isinstance(value, dict) else value
+            known = merged.get(key, value)
+            if isinstance(known, dict) != isinstance(value, dict):
+                raise DelayRLError(f"overrides: {key} is a table in one place and a value in another")
+            merged[key] = known | value if isinstance(value, dict) else value
     return merged
 
 
