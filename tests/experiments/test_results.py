@@ -148,6 +148,26 @@ def test_an_episode_twice(finished, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("change", ["{}", "5", '"step": null', '"return": NaN', '"return": "1"'])
+def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
+    """One line, from the report and before anything is published."""
+    grid, runs = finished
+    cell = Cell(**(vars(grid.cells[0]) | {"id": "5678"}))
+    run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
+    run.remove()
+    run.create({k: v for k, v in source.config.items() if k != "format"})
+    run.append("rows", source.read("rows"))
+    line = json.dumps(source.read("rows")[0] | json.loads(f"{{{change}}}")) if ":" in change else change
+    with open(run.path / "rows.jsonl", "a") as file:
+        file.write(line + "\n")
+    alone = Grid("alone", "", Path("alone.toml"), (cell,))
+    for what in (lambda: collect(alone, runs, tmp_path / "t.sqlite"), lambda: list(rows_of([cell], runs))):
+        with pytest.raises(delayrl.DelayRLError, match=r"seed0 holds a damaged row: ") as error:
+            what()
+        assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_worker(finished, tmp_path: Path) -> None:
     """A finished cell is left alone; a held one too; a mistake is one line, and the cell's state."""
     grid, runs = finished

@@ -7,6 +7,7 @@ rows give the same bytes, so that a committed table changes only where results d
 
 import contextlib
 import json
+import math
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -22,8 +23,8 @@ from delayrl.runs import Run
 
 SCHEMA = 1
 Row = dict[str, Any]
-OWN = ("step", "policy", "episode", "reset_seed", "return", "length")
-"""What differs between the rows of a run; the rest stands once for each run."""
+OWN = {"step": int, "policy": str, "episode": int, "reset_seed": int, "return": float, "length": int}
+"""What differs between the rows of a run, and of which type it is; the rest stands once for each run."""
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE cells (id TEXT PRIMARY KEY, number INTEGER, cell TEXT, state TEXT, step INTEGER, steps_per_second REAL);
@@ -43,8 +44,17 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
     """Rows of the cells as the run folders hold them now, each with its cell's id."""
     for cell in cells:
         for path in folders.seed_folders(runs / cell.folder, cell.seeds):
-            for row in Run(path).read("rows"):
+            for row in _read(path):
                 yield row | {"cell": cell.id}
+
+
+def _read(path: Path) -> list[Row]:
+    rows = Run(path).read("rows")
+    for row in rows:
+        whole = isinstance(row, dict) and all(type(row.get(name)) is kind for name, kind in OWN.items())
+        if not whole or not math.isfinite(row["return"]):
+            raise DelayRLError(f"{path} holds a damaged row: {str(row)[:200]}")
+    return rows
 
 
 def collect(grid: Grid, runs: Path, out: Path) -> int:
@@ -60,7 +70,7 @@ def collect(grid: Grid, runs: Path, out: Path) -> int:
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
     if next(rows_of(grid.cells, runs), None) is None:
         raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
-    draft = out.with_name(f".{out.name}.draft")
+    draft = out.with_name(f".{out.name}-{os.getpid()}.draft")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         draft.unlink(missing_ok=True)
@@ -85,7 +95,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
         table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", (cell.id, number, text, p.state, p.step, p.speed))
         used = _versions(runs / cell.folder)
         for path, seed in zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True):
-            rows = Run(path).read("rows")
+            rows = _read(path)
             if not rows:
                 continue
             config = dict(Run(path).config)
