@@ -11,7 +11,10 @@ import jax
 
 
 def commit() -> str | None:
-    """The commit of the checkout that the package lies in, marked where it has been changed; None outside of one."""
+    """The commit of the checkout that the package lies in, marked where it has been changed; None outside of one.
+
+    A package that is installed into a folder of another project's checkout is not in that checkout.
+    """
     here = Path(__file__).parent
 
     def git(*words: str) -> str:
@@ -20,6 +23,7 @@ def commit() -> str | None:
         ).stdout.strip()
 
     try:
+        git("ls-files", "--error-unmatch", Path(__file__).name)  # else it is somebody else's checkout
         return git("rev-parse", "--short=12", "HEAD") + (
             "-changed" if git("status", "--porcelain", "--", str(here)) else ""
         )

@@ -2,12 +2,14 @@
 
 import json
 import sqlite3
+import subprocess
 from pathlib import Path
 
 import pytest
 from support import tiny
 
 import delayrl
+from delayrl import provenance
 from delayrl.cli import main
 from delayrl.experiments import folders
 from delayrl.experiments.grid import Cell, Grid, load_grid
@@ -236,3 +238,28 @@ def test_bad_commands(words: str, expected: str, tmp_path: Path, monkeypatch, ca
     assert captured.err.count("\n") == 1
     assert expected in captured.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_commit(tmp_path: Path, monkeypatch) -> None:
+    """That of our checkout, marked where it was changed; not that of a project that has us in its environment."""
+
+    def git(*words: str) -> str:
+        author = ("-c", "user.name=a", "-c", "user.email=a@b")
+        command = ["git", "-C", str(tmp_path), *author, *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    package = tmp_path / "environment" / "delayrl"
+    package.mkdir(parents=True)
+    (package / "provenance.py").write_text("")
+    monkeypatch.setattr(provenance, "__file__", str(package / "provenance.py"))
+    assert provenance.commit() is None
+    git("init", "--quiet")
+    (tmp_path / ".gitignore").write_text("environment")
+    git("add", ".gitignore")
+    git("commit", "--quiet", "-m", "theirs")
+    assert provenance.commit() is None
+    git("add", "--force", "environment")
+    git("commit", "--quiet", "-m", "ours")
+    assert provenance.commit() == git("rev-parse", "--short=12", "HEAD")
+    (package / "provenance.py").write_text("1")
+    assert provenance.commit() == git("rev-parse", "--short=12", "HEAD") + "-changed"
