@@ -213,6 +213,25 @@ def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
     assert "8 rows; 1 of 2 cells are done" in capsys.readouterr().out
 
 
+def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkeypatch) -> None:
+    """Not by hundreds of numbers."""
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("\n".join("1234" * 100))
+    file = tiny(tmp_path, text=MIXED.replace("delays = [2]", 'delays = ["recorded:log.csv"]'), name="recorded")
+    cell = load_grid(file).cells[0]
+    assert len(cell.delay) > 400
+    assert work_on(cell, Path("runs")) == Outcome("done", "")
+    (label,) = {row["delay"] for row in rows_of([cell], Path("runs"))}
+    for command in ("plan", "status", "report"):
+        main(["bench", command, str(file), "--runs", "runs"])
+        out = capsys.readouterr().out
+        assert label in out or command == "report"
+        assert "1,2,3,4,1" not in out
+    text = Path("runs/recorded-report/report.md").read_text()
+    assert label in text
+    assert "1,2,3,4,1" not in text
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

@@ -119,7 +119,7 @@ def _write_report(
     from delayrl.experiments.summary import Cell as Shown
 
     shown = [
-        Shown(c.id, c.agent, c.env, c.delay, c.preset, c.protocol, c.seeds, c.overrides, p.state, p.step, c.steps)
+        Shown(c.id, c.agent, c.env, c.label, c.preset, c.protocol, c.seeds, c.overrides, p.state, p.step, c.steps)
         for c, p in cells
     ]
     print(f"open {report(rows, shown, out, title, versions)}; the same as Markdown lies beside it")

@@ -76,14 +76,19 @@ class Cell:
     id: str
 
     @property
+    def label(self) -> int | str:
+        """The delay as rows name it: a long list of numbers is shortened."""
+        return as_delay(self.delay).label()
+
+    @property
     def folder(self) -> str:
         """Name of its folder: readable, and of its own."""
-        return re.sub(r"[^\w.-]+", "-", f"{self.env}-delay{as_delay(self.delay).label()}-{self.agent}-{self.id}")
+        return re.sub(r"[^\w.-]+", "-", f"{self.env}-delay{self.label}-{self.agent}-{self.id}")
 
     def __str__(self) -> str:
         first, last = self.seeds[0], self.seeds[-1]
         seeds = f"seed {first}" if first == last else f"seeds {first}-{last}"
-        return f"{self.agent} on {self.env}, delay {as_delay(self.delay).label()}, {seeds}"
+        return f"{self.agent} on {self.env}, delay {self.label}, {seeds}"
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def table(grid: Grid, runs: Path, workers: int) -> str:
                 cell.id,
                 cell.agent,
                 cell.env,
-                str(cell.delay),
+                str(cell.label),
                 seeds,
                 p.state,
                 steps,
