@@ -249,6 +249,24 @@ def test_a_cell_of_another_runner_is_waited_for(tmp_path: Path) -> None:
     assert len(report.done) == 2
 
 
+def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
+    """Or the log of the worker that holds it would be emptied, again and again."""
+    backend, some = Script(sac=[DONE], bpql=[DONE]), cells("sac", "bpql")
+    folders.prepare(tmp_path / some[0].folder, some[0])
+    with contextlib.ExitStack() as held:
+        held.enter_context(folders.hold(tmp_path / some[0].folder))
+        free = time.monotonic() + 0.5
+
+        def tick() -> None:
+            if time.monotonic() > free:
+                held.close()
+            else:
+                assert "sac" not in backend.started
+
+        assert len(work_off(some, tmp_path, backend, tick=tick).done) == 2
+    assert backend.started == ["bpql", "sac"]
+
+
 def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> None:
     """After the grace, so that a queue's wall-clock limit holds."""
     sleep = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"

@@ -179,6 +179,10 @@ def work_off(
                 if now < not_before.get(cell.id, 0):
                     waiting.append(cell)
                     continue
+                if folders.holder(runs / cell.folder) is not None:  # a worker of ours would empty its log
+                    waiting.append(cell)
+                    not_before[cell.id] = now + 2
+                    continue
                 if cell.id not in reached:
                     reached[cell.id] = folders.stored(runs / cell.folder, cell.seeds)[0]
                 backend.start(cell)
