@@ -343,6 +343,13 @@ def test_the_page_says_what_the_summary_says() -> None:
     json.dumps(found, allow_nan=False)
 
 
+def test_steps_are_whole_and_exact() -> None:
+    cells = small(total=1_234_567, done=1_234_567)
+    every = [r | {"step": 1_234_567} for r in anchored(cells, vdpo=[[0.0, 0, 500], [0.0, 0, 500]]) if r["step"] == 300]
+    found = payload(summarise(every, list(cells.values())), "title")
+    assert [r["reached"][0] for r in found["results"] if not r["isAnchor"]] == [1_234_567]
+
+
 def test_report_of_committed_rows(tmp_path: Path) -> None:
     files = [RESULTS / f"{name}.jsonl" for name in ("pendulum", "reacher", "walk")]
     out = report(read(files), [], tmp_path)
@@ -444,6 +451,13 @@ def test_page_sorts(opened: Any) -> None:
     view.locator("#normalised-0 thead button", has_text="vdpo").click()
     values = [float(v.split(" ")[0]) for v in column(view, "normalised-0", 7)]
     assert values == sorted(values)
+
+
+def test_page_shows_whole_steps(opened: Any) -> None:
+    cells = small()
+    view = opened(list(cells.values()), anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]]))
+    heads = view.locator("#all thead th").all_inner_texts()
+    assert sorted(column(view, "all", heads.index("Steps to Ret_df"))) == ["", "200", "300"]
 
 
 def test_page_filters(opened: Any) -> None:

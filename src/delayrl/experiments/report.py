@@ -271,7 +271,9 @@ def _md_results(summary: Summary, results: Iterable[Result]) -> str:
 
 
 def _digits(value: Any) -> Any:
-    """Five digits, and nothing for NaN: what JSON can say."""
+    """Five digits, whole numbers (steps) all, and nothing for NaN: what JSON can say."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
     if isinstance(value, float):
         return float(f"{value:.5g}") if math.isfinite(value) else None
     if hasattr(value, "tolist"):
