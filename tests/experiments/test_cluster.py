@@ -1,5 +1,6 @@
 """Ray: the same cells, on nodes that may die. Skipped where Ray is not installed."""
 
+import math
 import os
 import socket
 import subprocess
@@ -67,6 +68,22 @@ def test_an_address_that_is_not_rays(tmp_path: Path) -> None:
     assert done.returncode == 2, done.stderr
     assert done.stderr.splitlines()[-1].startswith(f"delayrl: no Ray cluster at {address}")
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(("cpus", "gpus"), [(0.0, 0.0), (-1.0, 0.0), (1.0, -1.0), (1.0, math.nan), (math.inf, 0.0)])
+def test_cores_that_cannot_be(cpus: float, gpus: float, tmp_path: Path) -> None:
+    with pytest.raises(delayrl.DelayRLError, match="a cell takes cores, or GPUs"):
+        OnRay(tmp_path, None, None, cpus, gpus)
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_more_than_the_cluster_has(tmp_path: Path) -> None:
+    """One line; it would wait for ever."""
+    with pytest.raises(delayrl.DelayRLError, match=r"a cell takes 1 cores and 99 GPUs .* has \d+ and \d+$"):
+        OnRay(tmp_path, None, None, 1.0, 99.0)
+    assert not ray.is_initialized()
 
 
 def test_a_folder_that_the_node_does_not_see(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ The actor supervises a worker process as the local backend does, so a node that 
 and they are started again elsewhere. All nodes must see the runs' folder, and have delayrl installed.
 """
 
+import math
 import os
 import platform
 import socket
@@ -59,9 +60,18 @@ class OnRay:
     running: dict[str, tuple[Cell, Any, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not (0 <= self.cpus < math.inf and 0 <= self.gpus < math.inf and self.cpus + self.gpus):
+            raise DelayRLError(f"a cell takes cores, or GPUs; got --cpus {self.cpus:g} --gpus {self.gpus:g}")
         self._ray = connect(self.address)
         resources = {"num_cpus": self.cpus, "num_gpus": self.gpus}
         self._actor = self._ray.remote(max_concurrency=2, max_restarts=0, **resources)(Supervisor)
+        if self.room() < 1:  # waiting would never end
+            have = self._ray.cluster_resources()
+            self.close()
+            raise DelayRLError(
+                f"a cell takes {self.cpus:g} cores and {self.gpus:g} GPUs (--cpus, --gpus), all of this Ray cluster has "
+                f"{have.get('CPU', 0):g} and {have.get('GPU', 0):g}"
+            )
 
     def room(self) -> int:
         """As many cells as the cluster's cores (and GPUs) hold now, at the most `workers`."""
