@@ -233,6 +233,21 @@ def test_tries_are_bounded(tmp_path: Path) -> None:
     assert "2 failed" in line(now, 1)
 
 
+def test_a_worker_that_cannot_be_started(tmp_path: Path) -> None:
+    """Its cell has failed, the others go on."""
+
+    class Refuses(Script):
+        def start(self, cell: Cell) -> None:
+            if cell.agent == "sac":
+                raise delayrl.DelayRLError("the disk is full")
+            super().start(cell)
+
+    report = work_off(cells("sac", "bpql"), tmp_path, Refuses(bpql=[DONE]))
+    assert report.failed == {"sac": "the disk is full"}
+    assert [cell.agent for cell in report.done] == ["bpql"]
+    assert [p.state for _, p in standing(cells("sac"), tmp_path)] == ["failed"]
+
+
 def test_tries_with_progress_do_not_count(tmp_path: Path, monkeypatch) -> None:
     steps = iter([0, 0, 0, 10, 10, 20, 20, 30])
     monkeypatch.setattr(folders, "stored", lambda *_: (next(steps), False))

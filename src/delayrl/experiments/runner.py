@@ -162,6 +162,13 @@ def work_off(
     active, not_before = 0, dict[str, float]()
     in_vain, reached = Counter[str](), dict[str, int]()
     asked: float | None = None
+
+    def fail(cell: Cell, line: str) -> None:
+        report.failed[cell.id] = line
+        with contextlib.suppress(DelayRLError):  # the disk may be full
+            folders.note(runs / cell.folder, "failed", line=line)
+        say(f"failed: {cell}: {line}")
+
     try:
         while waiting or active:
             now = time.monotonic()
@@ -185,8 +192,11 @@ def work_off(
                     continue
                 if cell.id not in reached:
                     reached[cell.id] = folders.stored(runs / cell.folder, cell.seeds)[0]
-                backend.start(cell)
-                active += 1
+                try:
+                    backend.start(cell)
+                    active += 1
+                except DelayRLError as error:
+                    fail(cell, str(error))
             for cell, outcome in backend.ended():
                 active -= 1
                 kind, line = outcome
@@ -199,10 +209,7 @@ def work_off(
                     report.done.append(cell)
                     say(f"done: {cell}")
                 elif kind == "failed":
-                    report.failed[cell.id] = line
-                    with contextlib.suppress(DelayRLError):  # the disk may be full
-                        folders.note(runs / cell.folder, "failed", line=line)
-                    say(f"failed: {cell}: {line}")
+                    fail(cell, line)
                 elif asked is not None:
                     report.left.append(cell)
                 elif kind == "locked":  # another runner's; perhaps it leaves it unfinished
