@@ -296,6 +296,17 @@ def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> Non
     assert {cell.agent for cell in report.left} == {"sac", "bpql"}
 
 
+def test_journal_after_a_crash(tmp_path: Path) -> None:
+    """A line that was cut off does not swallow the next one."""
+    folders.note(tmp_path, "begun")
+    with open(tmp_path / "journal.jsonl", "a") as file:
+        file.write('{"event": "do')
+    folders.note(tmp_path, "begun", versions={"jax": "1"})
+    folders.note(tmp_path, "done")
+    assert [e["event"] for e in folders.journal(tmp_path)] == ["begun", "begun", "done"]
+    assert folders.journal(tmp_path)[1]["versions"] == {"jax": "1"}
+
+
 def test_lock(tmp_path: Path) -> None:
     """One holder; gone with its process; looking does not take it."""
     assert folders.holder(tmp_path) is None

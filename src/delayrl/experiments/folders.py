@@ -86,8 +86,10 @@ def note(folder: Path, event: str, **more: Any) -> None:
     """Add an event to the cell's journal."""
     line = {"event": event, "time": round(time.time(), 1), "host": platform.node(), **more}
     try:
-        with open(folder / "journal.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
+        with open(folder / "journal.jsonl", "a+b") as file:
+            file.seek(-1 if file.tell() else 0, os.SEEK_END)
+            cut = file.read() not in (b"", b"\n")  # by a crash, or a full disk
+            file.write(b"\n" * cut + json.dumps(line).encode() + b"\n")
     except OSError as error:
         raise DelayRLError(f"cannot write to {folder}: {error.strerror}") from error
 
