@@ -69,8 +69,8 @@ class OnRay:
             have = self._ray.cluster_resources()
             self.close()
             raise DelayRLError(
-                f"a cell takes {self.cpus:g} cores and {self.gpus:g} GPUs (--cpus, --gpus), all of this Ray cluster has "
-                f"{have.get('CPU', 0):g} and {have.get('GPU', 0):g}"
+                f"a cell takes {self.cpus:g} cores and {self.gpus:g} GPUs (--cpus, --gpus), all of this Ray cluster "
+                f"has {have.get('CPU', 0):g} and {have.get('GPU', 0):g}"
             )
 
     def room(self) -> int:
