@@ -167,6 +167,16 @@ def test_seeds_that_are_missing_are_told() -> None:
     assert math.isnan(summary.aggregates[0].low)
 
 
+def test_a_failed_seed_beside_one_that_has_ended() -> None:
+    """A cell of its own, as with lockstep = 1: it did not fail at the last step of the other."""
+    cells = small() | {"vdpo": cell("vdpo", "delayrl/Ant-v4", 5, seeds=(0,), total=300, done=300)}
+    failed = cell("vdpo", "delayrl/Ant-v4", 5, seeds=(1,), id="1", total=300, done=100, status="failed")
+    todo = cell("vdpo", "delayrl/Ant-v4", 5, seeds=(2,), id="2", total=300, done=0, status="todo")
+    summary = summarise(anchored(cells, vdpo=[[0.0, 1, 60]]), [*cells.values(), failed, todo])
+    entry = summary.entry(summary.tables[0], ("delayrl/Ant-v4", 5), "vdpo")
+    assert entry.note == "1 of 3 seeds · failed at 100 of 300 steps"
+
+
 def test_cells_that_share_all_but_their_seeds_are_one_and_others_are_not_mixed() -> None:
     cells = small()
     more = cell("vdpo", "delayrl/Ant-v4", 5, id="more", seeds=(7,), total=300, done=300)

@@ -107,7 +107,7 @@ class Result:
 
     Attributes:
         place: its row and column; the label is the agent, with what tells it from the agent's other cells.
-        status, done, total: as a cell's.
+        status, done, total: as a cell's; of several cells the worst, and the least done of those.
         seeds: how many are to be run. runs: how many of them `curves` holds.
         partial: no seed has reached its last step, so that the numbers are those of the steps so far.
         privileged: whether its behaviour reads the true state while it trains.
@@ -149,7 +149,8 @@ class Result:
         """A word on what is not finished."""
         if self.status == "failed" or (self.partial and self.runs):
             word = "failed at" if self.status == "failed" else "at"
-            return [f"{word} {max([self.done, *self.curves.steps[-1:].tolist()]):,} of {self.total:,} steps"]
+            seen = self.curves.steps[-1:].tolist() if self.partial else []  # else those are of seeds that have ended
+            return [f"{word} {max([self.done, *seen]):,} of {self.total:,} steps"]
         return [self.status] if self.status == "running" else []
 
     @property
@@ -441,7 +442,7 @@ def _result(place: Place, cells: Sequence[Cell], points: Sequence[_Points]) -> R
         cells[0].agent,
         cells[0].overrides,
         status,
-        min(cell.done for cell in cells),
+        min([cell.done for cell in cells if cell.status == status] or [cell.done for cell in cells]),
         total,
         len({seed for cell in cells for seed in cell.seeds} | set(runs)),
         not complete,
