@@ -177,6 +177,24 @@ def test_a_failed_seed_beside_one_that_has_ended() -> None:
     assert entry.note == "1 of 3 seeds · failed at 100 of 300 steps"
 
 
+def test_over_all_delays_conditions_are_counted() -> None:
+    """Or an agent that was spared the long delays would look as if it had had them."""
+    late = {delay: cell("vdpo", "delayrl/Ant-v4", delay, 2, total=300, done=300) for delay in (5, 25)}
+    cells = small() | {"bpql": cell("bpql", "delayrl/Ant-v4", 5, 2, total=300, done=300)}
+    every = anchored(cells, vdpo=[[0.0, 0, 60], [0.0, 0, 60]], bpql=[[0.0, 0, 60], [0.0, 0, 60]])
+    every += curve(late[25], 0, [0, 0, 30]) + curve(late[25], 1, [0, 0, 30])
+    summary = summarise(every, [*cells.values(), late[25]])
+    found = {(a.label, a.delay): (a.tasks, a.runs) for a in summary.aggregates}
+    assert found == {
+        ("bpql", 5): (1, 2),
+        ("vdpo", 5): (1, 2),
+        ("vdpo", 25): (1, 2),
+        ("bpql", None): (1, 2),
+        ("vdpo", None): (2, 4),
+    }
+    assert "2 conditions, 4 runs" in markdown(summary, "t", {})
+
+
 def test_cells_that_share_all_but_their_seeds_are_one_and_others_are_not_mixed() -> None:
     cells = small()
     more = cell("vdpo", "delayrl/Ant-v4", 5, id="more", seeds=(7,), total=300, done=300)

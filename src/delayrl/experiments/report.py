@@ -228,7 +228,8 @@ def _md_aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
         for label in labels:
             a = of.get((delay, label))
             interval = f"<br>{a.low:.2f} to {a.high:.2f}" if a and not math.isnan(a.low) else ""
-            counts = _grey(f"{_count(a.tasks, 'task')}, {_count(a.runs, 'run')}") if a else ""
+            what = "condition" if delay is None else "task"
+            counts = _grey(f"{_count(a.tasks, what)}, {_count(a.runs, 'run')}") if a else ""
             line.append(f"**{a.iqm:.2f}**{interval}<br>{counts}" if a else "")
         body.append(line)
     return _rows(["Δ", *(_md(summary.name(label)) for label in labels)], body)

@@ -181,7 +181,7 @@ class Table:
 
 
 class Aggregate(NamedTuple):
-    """An agent over all tasks of one delay (None: of all constant delays)."""
+    """An agent over all tasks of one delay (None: of all constant delays; `tasks` then counts each with each delay)."""
 
     setting: Setting
     delay: Delay | None
@@ -529,14 +529,12 @@ def _tables(results: Mapping[Place, Result]) -> list[Table]:
 def _aggregates(results: Mapping[Place, Result]) -> list[Aggregate]:
     """IQM and performance profile of each agent over the tasks of each delay, with 95 % intervals."""
     strata: dict[tuple[Setting, Delay | None, str], list[Floats]] = defaultdict(list)
-    tasks: dict[tuple[Setting, Delay | None, str], set[str]] = defaultdict(set)
     for place, result in results.items():
         scores = result.normalise(result.curves.final)
         if result.is_anchor or result.partial or not scores.size or np.isnan(scores).any():
             continue
         for delay in (place.delay, *([] if isinstance(place.delay, str) else [None])):
             strata[place.setting, delay, place.label].append(scores)
-            tasks[place.setting, delay, place.label].add(place.env)
     several = {s for s, _, _ in strata if len({d for t, d, _ in strata if t == s and isinstance(d, int)}) > 1}
     made = []
     for (setting, delay, label), of in strata.items():
@@ -547,8 +545,8 @@ def _aggregates(results: Mapping[Place, Result]) -> list[Aggregate]:
         profile = statistics.performance_profile(pooled, THRESHOLDS)
         band = statistics.stratified_bootstrap(of, lambda x: statistics.performance_profile(x, THRESHOLDS), 500)
         iqm = float(statistics.interquartile_mean(pooled))
-        count = len(tasks[setting, delay, label])
-        made.append(Aggregate(setting, delay, label, iqm, float(low), float(high), count, pooled.size, profile, *band))
+        counts = len(of), pooled.size
+        made.append(Aggregate(setting, delay, label, iqm, float(low), float(high), *counts, profile, *band))
     return sorted(
         made,
         key=lambda a: (
