@@ -365,7 +365,7 @@ def test_the_page_says_what_the_summary_says() -> None:
     assert found["agents"][vdpo]["name"] == "vdpo †"
     (result,) = [r for r in found["results"] if r["agent"] == vdpo]
     assert result["mean"] == [5, 115, 110]
-    assert result["normalised"] == [1, 0.70711]
+    assert result["normalised"] == pytest.approx([1, math.sqrt(0.5)])
     assert result["reached"] == [200, 2]
     assert found["anchors"][result["anchor"]]["random"]["value"] == 10
     json.dumps(found, allow_nan=False)
@@ -486,6 +486,14 @@ def test_page_shows_whole_steps(opened: Any) -> None:
     view = opened(list(cells.values()), anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]]))
     heads = view.locator("#all thead th").all_inner_texts()
     assert sorted(column(view, "all", heads.index("Steps to Ret_df"))) == ["", "200", "300"]
+
+
+def test_page_rounds_once(opened: Any) -> None:
+    """A return of 3,406.46 is the same in every table."""
+    cells = small()
+    view = opened(list(cells.values()), anchored(cells, vdpo=[[0.0, 0, 3406.46], [0.0, 0, 3406.46]]))
+    assert "raw 3,406 ± 0" in view.locator("#normalised-0").inner_text()
+    assert "3,406 ± 0" in view.locator("#all").inner_text()
 
 
 def test_page_filters(opened: Any) -> None:

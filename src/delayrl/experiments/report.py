@@ -271,15 +271,18 @@ def _md_results(summary: Summary, results: Iterable[Result]) -> str:
 # HTML
 
 
-def _digits(value: Any) -> Any:
-    """Five digits, whole numbers (steps) all, and nothing for NaN: what JSON can say."""
+def _digits(value: Any, digits: int = 12) -> Any:
+    """So many digits, whole numbers (steps) all, and nothing for NaN: what JSON can say.
+
+    Five are enough for what is drawn. What is written is rounded by the page, and not twice.
+    """
     if isinstance(value, float) and value.is_integer():
         return int(value)
     if isinstance(value, float):
-        return float(f"{value:.5g}") if math.isfinite(value) else None
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     if hasattr(value, "tolist"):
-        return _digits(value.tolist())
-    return [_digits(x) for x in value] if isinstance(value, list | tuple) else value
+        return _digits(value.tolist(), digits)
+    return [_digits(x, digits) for x in value] if isinstance(value, list | tuple) else value
 
 
 def _anchor(anchor: Anchor) -> dict[str, Any]:
@@ -332,9 +335,9 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
             "reached": [_digits(r.steps_to_threshold), r.seeds_at_threshold],
             "anchor": anchor_of(r),
             "steps": curve.steps.tolist(),
-            "mean": _digits(curve.mean) if r.runs else [],
-            "std": _digits(std),
-            "each": _digits(curve.returns) if r.runs > 1 else [],
+            "mean": _digits(curve.mean, 5) if r.runs else [],
+            "std": _digits(std, 5),
+            "each": _digits(curve.returns, 5) if r.runs > 1 else [],
         }
 
     def table_of(t: Table) -> dict[str, Any]:
@@ -378,7 +381,7 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
                 "iqm": _digits([a.iqm, a.low, a.high]),
                 "tasks": a.tasks,
                 "runs": a.runs,
-                "profile": _digits([a.profile, a.profile_low, a.profile_high]),
+                "profile": _digits([a.profile, a.profile_low, a.profile_high], 5),
             }
             for a in summary.aggregates
         ],
