@@ -282,3 +282,36 @@ def test_commit(tmp_path: Path, monkeypatch) -> None:
     assert provenance.commit() == git("rev-parse", "--short=12", "HEAD")
     (package / "provenance.py").write_text("1")
     assert provenance.commit() == git("rev-parse", "--short=12", "HEAD") + "-changed"
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("cell", '{"agent": 5}'),
+        ("cell", '{"env": null}'),
+        ("cell", '{"overrides": []}'),
+        ("cell", '{"steps": "x"}'),
+        ("cell", '{"seeds": {}}'),
+        ("state", '"gone"'),
+        ("step", '"x"'),
+        ("versions", "[5]"),
+    ],
+)
+def test_a_table_with_wrong_types(finished, tmp_path: Path, column: str, value: str, capsys) -> None:
+    """It may be from anywhere: one line."""
+    grid, runs = finished
+    file = tmp_path / "t.sqlite"
+    collect(grid, runs, file)
+    with sqlite3.connect(file) as table:
+        where = "runs" if column == "versions" else "cells"
+        if column == "cell":
+            table.execute("UPDATE cells SET cell = json_patch(cell, ?)", (value,))
+        else:
+            table.execute(f"UPDATE {where} SET {column} = ?", (value if column == "versions" else json.loads(value),))
+    table.close()
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "report", str(file)])
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "is no table of results, or damaged: " in error

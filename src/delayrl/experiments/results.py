@@ -12,11 +12,11 @@ import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from delayrl.errors import DelayRLError
 from delayrl.experiments import folders
-from delayrl.experiments.folders import Progress
+from delayrl.experiments.folders import Progress, State
 from delayrl.experiments.grid import Cell, Grid
 from delayrl.experiments.status import progress
 from delayrl.runs import Run
@@ -25,6 +25,16 @@ SCHEMA = 1
 Row = dict[str, Any]
 OWN = {"step": int, "policy": str, "episode": int, "reset_seed": int, "return": float, "length": int}
 """What differs between the rows of a run, and of which type it is; the rest stands once for each run."""
+CELL: dict[str, Any] = {
+    "agent": str,
+    "env": str,
+    "delay": int | str,
+    "preset": str,
+    "protocol": str,
+    "seeds": list,
+    "overrides": dict,
+    "steps": int,
+}
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE cells (id TEXT PRIMARY KEY, number INTEGER, cell TEXT, state TEXT, step INTEGER, steps_per_second REAL);
@@ -144,6 +154,9 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list
         columns = "id, cell, state, step, steps_per_second"
         for key, text, state, step, speed in table.execute(f"SELECT {columns} FROM cells ORDER BY number"):
             values = json.loads(text)
+            wrong = [name for name, kind in CELL.items() if not isinstance(values[name], kind)]
+            if wrong or state not in get_args(State) or type(step) is not int:
+                raise ValueError(f"cell {key} has no good {', '.join(wrong) or 'state'}")
             cell = Cell(**(values | {"seeds": tuple(values["seeds"]), "id": key}))
             cells.append((cell, Progress(state, step, speed, "")))
         shared = {
@@ -155,7 +168,7 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list
             shared[run] | dict(zip(OWN, values, strict=True)) | (json.loads(more) if more else {})
             for run, more, *values in table.execute(f"SELECT run, more, {columns} FROM rows")
         ]
-        used = [version for (text,) in table.execute("SELECT versions FROM runs") for version in json.loads(text)]
+        used = [dict(one) for (text,) in table.execute("SELECT versions FROM runs") for one in json.loads(text)]
     return rows, cells, _distinct(used)
 
 
