@@ -122,6 +122,8 @@ def test_reference_rows_anchor_where_there_is_no_sac() -> None:
     result = of(summary, "vdpo")
     assert result.reference_anchor[:3] == (210, 2, "the reference inside vdpo, Δ=5")
     np.testing.assert_allclose(result.normalise(result.curves.final), [0.5, 0.5])
+    for table in summary.tables:  # not only below: the tables' heads promise the delay-free return
+        assert "Ret_df: the reference inside vdpo, Δ=5" in summary.entry(table, ("delayrl/Ant-v4", 5), "vdpo").note
     assert "the reference inside vdpo" in markdown(summary, "t", {})
 
 
@@ -346,7 +348,9 @@ def test_names_cannot_break_out_of_the_page(tmp_path: Path) -> None:
 
 def test_names_cannot_break_a_markdown_table() -> None:
     cells, every = nasty()
+    every += [r | {"policy": "reference"} for r in every if r["agent"] in NASTY]  # which anchors, and is named for it
     text = markdown(summarise(every, cells), EVIL, {})
+    assert "Ret\\_df: the reference inside" in text
     assert not re.search(r"<(?!br>|span style=\"color:#888\">|/span>)", text)
     widths: list[int] = []
     for line in text.splitlines():

@@ -172,7 +172,7 @@ def _md_table(summary: Summary, table: Table) -> str:
         line = [_md(env), _md(delay)]
         for column in table.columns:
             ours, raw, note, theirs = _words(table, summary.entry(table, (env, delay), column))
-            parts = [f"**{ours}**" if ours else "", f"raw {raw}" if raw else "", note]
+            parts = [f"**{ours}**" if ours else "", f"raw {raw}" if raw else "", _md(note)]
             line.append("<br>".join(p for p in [*parts, _grey(f"paper {theirs}") if theirs else ""] if p))
         body.append(line)
     return _rows(["Task", "Δ", *(_md(summary.name(column)) for column in table.columns)], body)

@@ -74,12 +74,16 @@ NOTHING = Curves(*statistics.common_steps([]))
 
 
 class Anchor(NamedTuple):
-    """A return that others are measured by: its value (NaN: there is none), how many runs, and where it is from."""
+    """A return that others are measured by: its value (NaN: there is none), how many runs, and where it is from.
+
+    `inside`: it is of a reference inside another agent, for want of a delay-free SAC.
+    """
 
     value: float = NAN
     runs: int = 0
     source: str = ""
     curves: Curves = NOTHING
+    inside: bool = False
 
 
 NO_ANCHOR = Anchor()
@@ -258,6 +262,8 @@ class Summary:
                 notes += [f"{n}/{result.runs} seeds"] if (n := result.seeds_at_threshold) else []
         else:
             value, std = statistics.mean_std(result.normalise(result.curves.final))
+        if result.reference_anchor.inside and result.runs:
+            notes.append(f"Ret_df: {result.reference_anchor.source}")
         note = " · ".join([*notes, *result.progress])
         return Entry(value, std, raw, raw_std, missed, result.partial, note, published)
 
@@ -470,7 +476,7 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
     elif inside:
         best = min(inside, key=lambda o: (o.agent != "vdpo", o.agent != "lifting", len(o.overrides), _order(o.place)))
         name = f"the reference inside {best.place.label}, Δ={best.place.delay}"
-        high = Anchor(float(best.reference.final.mean()), best.reference.returns.shape[0], name, best.reference)
+        high = Anchor(float(best.reference.final.mean()), best.reference.returns.shape[0], name, best.reference, True)
     return replace(result, random_anchor=low, reference_anchor=high)
 
 
