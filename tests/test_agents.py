@@ -15,7 +15,7 @@ from delayrl.agents import AGENTS
 from delayrl.agents.random import Random
 from delayrl.agents.vdpo import VDPO, Unseen, unseen
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program
+from delayrl.learning import Program, Stored
 from delayrl.types import Seen, Spec, Transition
 
 ENV, OBS, ACT = "Reacher-v5", 10, 2
@@ -39,7 +39,9 @@ def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=N
     for step, transition in enumerate(transitions, 1):
         due = tuple(i for i, p in enumerate(program.phases) if step > start and step % p.every == 0)
         batched = Transition(*(np.asarray(x)[None] for x in transition))
-        learner, metrics = program.learn(learner, batched, np.full(1, hidden, np.int32), keys, step, due)
+        learner, metrics = program.learn(
+            learner, [Stored(batched, np.full(1, hidden, np.int32))], keys, range(step, step + 1), [due]
+        )
     return learner, metrics, keys
 
 
@@ -120,7 +122,9 @@ def test_lockstep_seeds_are_seeds_alone(name: str) -> None:
         for step in range(1, 61):
             due = tuple(i for i, p in enumerate(program.phases) if step > 45 and step % p.every == 0)
             batch = jax.tree.map(lambda *x: np.stack(x), *[data[s][step - 1] for s in seeds])
-            learner, _ = program.learn(learner, batch, np.zeros(len(seeds), np.int32), keys, step, due)
+            learner, _ = program.learn(
+                learner, [Stored(batch, np.zeros(len(seeds), np.int32))], keys, range(step, step + 1), [due]
+            )
         return learner.agent
 
     together = run([0, 1, 2])
@@ -138,17 +142,17 @@ def test_a_block_of_steps_is_its_steps(name: str) -> None:
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
     ends = []
     for block in (1, 5):
-        learner, pending, due = program.init(keys, 100), [], []
-        for step, transition in enumerate(data, 1):
-            pending.append((jax.tree.map(lambda x: np.asarray(x)[None], transition), np.full(1, step % 3, np.int32)))
-            due.append(tuple(i for i, p in enumerate(program.phases) if step > 60 and step % p.every == 0))
-            if block == 1:
-                learner, metrics = program.learn(learner, *pending[0], keys, step, due[0])
-            elif step % block == 0:
-                learner, metrics = program.learn_block(learner, pending, keys, range(step - 4, step + 1), due)
-            pending, due = ([], []) if step % block == 0 else (pending, due)
+        learner, metrics = program.init(keys, 100), {}
+        for end in range(block, len(data) + 1, block):
+            steps = range(end - block + 1, end + 1)
+            stored = [
+                Stored(jax.tree.map(lambda x: np.asarray(x)[None], data[n - 1]), np.full(1, n % 3)) for n in steps
+            ]
+            due = [tuple(i for i, p in enumerate(program.phases) if n > 60 and n % p.every == 0) for n in steps]
+            learner, new = program.learn(learner, stored, keys, steps, due)
+            metrics |= new
         ends.append((learner, metrics))
-    assert set(ends[0][1]) <= set(ends[1][1])
+    assert set(ends[0][1]) == set(ends[1][1])
     for a, b in zip(jax.tree.leaves(ends[0][0]), jax.tree.leaves(ends[1][0]), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
@@ -159,16 +163,13 @@ def test_learning_copies_no_replay(seeds: int, block: int) -> None:
     """What the compiled step needs beside its arguments does not grow with the replay, which is updated in place."""
     program = program_of(TINY["bpql"], 3)
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
-    transition = jax.tree.map(lambda x: np.stack([x] * seeds), record(ENV, 3, 1)[0][0])
-    hidden, step = np.zeros(seeds, np.int32), np.int32(100)
-    learn, arguments = program._jitted_learn, (transition, hidden, keys, step)
-    if block > 1:
-        learn = program._jitted_block
-        arguments = (*jax.tree.map(lambda x: np.stack([x] * block), (transition, hidden)), keys, np.full(block, step))
+    step = jax.tree.map(lambda x: np.stack([[x] * seeds] * block), record(ENV, 3, 1)[0][0])
+    stored, steps = Stored(step, np.zeros((block, seeds), np.int32)), np.full(block, 100)
     needed = []
     for capacity in (200, 100_000):
         learner = jax.eval_shape(lambda capacity=capacity: program.init(keys, capacity))
-        compiled = learn.lower(learner, *arguments, index=0).compile({"xla_backend_optimization_level": 3})
+        lowered = program._jitted_learn.lower(learner, stored, keys, steps, index=0)
+        compiled = lowered.compile({"xla_backend_optimization_level": 3})
         needed.append(compiled.memory_analysis().temp_size_in_bytes)
     assert needed[0] == needed[1]
 

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.random import threefry_2x32
 from scipy import stats
 from scipy.special import erf
 
 from delayrl import networks
-from delayrl.transformer import dropout, dropout_masks, transformer, transformer_init
+from delayrl.transformer import dropout, dropout_masks, threefry, transformer, transformer_init
 
 SIZES = {"obs_size": 5, "action_size": 3, "length": 6, "width": 16, "layers": 3}
 
@@ -80,6 +81,13 @@ def test_dropout_is_off_without_key(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(transformer(params, obs, actions, 0.5), plain)
     dropped = transformer(params, obs, actions, 0.5, jax.random.key(0))
     assert np.abs(np.asarray(dropped - plain)).max() > 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31 + 5])
+def test_bits_are_threefry_of_jax(seed: int) -> None:
+    key = jax.random.key(seed)
+    expected = threefry_2x32(jax.random.key_data(key), jnp.arange(2 * 501, dtype=jnp.uint32))
+    np.testing.assert_array_equal(threefry(key, 501).reshape(-1), expected)
 
 
 @pytest.mark.parametrize("rate", [0.1, 0.5])

@@ -17,7 +17,7 @@ from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.delays import Channel, Constant, Delay, as_delay
 from delayrl.evaluation import evaluate
-from delayrl.learning import Program
+from delayrl.learning import Program, Stored
 from delayrl.training import Session
 from delayrl.types import Spec, Transition
 from delayrl.views import view
@@ -68,7 +68,9 @@ def test_every_agent_learns_under_random_delays(name: str) -> None:
     for step, transition in enumerate(transitions, 1):
         due = tuple(i for i, p in enumerate(program.phases) if step > 105 and step % p.every == 0)
         batched = Transition(*(np.asarray(x)[None] for x in transition))
-        learner, metrics = program.learn(learner, batched, np.zeros(1, np.int32), keys, step, due)
+        learner, metrics = program.learn(
+            learner, [Stored(batched, np.zeros(1, np.int32))], keys, range(step, step + 1), [due]
+        )
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(metrics))
     after = jax.device_get(learner.agent)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after) if np.issubdtype(x.dtype, np.floating))

@@ -21,6 +21,17 @@ class Learner(NamedTuple):
     replay: ring.Replay
 
 
+Hidden = Int[Array, " seeds"] | NDArray[np.int32]
+"""How many of the newest observations each learner may not look at, because not all of them have arrived."""
+
+
+class Stored(NamedTuple):
+    """A step of all seeds, and what is hidden after it."""
+
+    transition: Transition
+    hidden: Hidden
+
+
 class Program:
     """The jitted functions of one agent on one task. Every argument has a leading seed axis but `step`.
 
@@ -31,7 +42,7 @@ class Program:
         self.phases, self._agent, self._spec, self._whole = agent.phases(), agent, spec, whole
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="index", donate_argnums=0)
-        self._jitted_block = jax.jit(self._learn_block, static_argnames="index", donate_argnums=0)
+        self._jitted_update = jax.jit(self._update, static_argnames="index", donate_argnums=0)
 
     def init(self, keys: Key, capacity: int) -> Learner:
         """Fresh states and empty replays."""
@@ -44,42 +55,18 @@ class Program:
         return self._jitted_act(agent, seen, keys, np.int32(step))
 
     def learn(
-        self,
-        learner: Learner,
-        transition: Transition,
-        hidden: NDArray[np.int32],
-        keys: Key,
-        step: int,
-        due: tuple[int, ...],
+        self, learner: Learner, stored: list[Stored], keys: Key, steps: range, due: list[tuple[int, ...]]
     ) -> tuple[Learner, Metrics]:
-        """Store one step, and run the phases that are due; not waited for. The learner's old arrays are gone."""
-        metrics: Metrics = {}
-        new: Transition | None = transition
-        for index in due or (None,):  # the first call stores the step too: one call in an ordinary step
-            learner, more = self._jitted_learn(learner, new, hidden, keys, np.int32(step), index=index)
-            new, metrics = None, metrics | more
-        return learner, metrics
+        """Store the newest steps, and run the phases that are due at them; not waited for. The old arrays are gone.
 
-    def learn_block(
-        self,
-        learner: Learner,
-        pending: list[tuple[Transition, NDArray[np.int32]]],
-        keys: Key,
-        steps: range,
-        due: list[tuple[int, ...]],
-    ) -> tuple[Learner, Metrics]:
-        """`learn` for several steps (each with its `hidden`) in one call.
-
-        The first phase, where it is due at all of the steps, runs after each is stored, as ever; others after the last.
+        The first phase, where it is due at each of the steps, runs after each is stored; what else is due, at the end.
         """
-        transitions, hidden = jax.tree.map(lambda *x: np.stack(x), *pending)
-        index = 0 if all(0 in phases for phases in due) else None
-        learner, metrics = self._jitted_block(
-            learner, transitions, hidden, keys, np.array(steps, np.int32), index=index
-        )
+        always = 0 if all(0 in phases for phases in due) else None
+        block = jax.tree.map(lambda *x: np.stack(x), *stored)
+        learner, metrics = self._jitted_learn(learner, block, keys, np.array(steps, np.int32), index=always)
         for step, phases in zip(steps, due, strict=True):
-            for rare in [phase for phase in phases if phase != index]:
-                learner, more = self._jitted_learn(learner, None, hidden[-1], keys, np.int32(step), index=rare)
+            for index in (phase for phase in phases if phase != always):
+                learner, more = self._jitted_update(learner, stored[-1].hidden, keys, np.int32(step), index=index)
                 metrics = metrics | more
         return learner, metrics
 
@@ -96,21 +83,24 @@ class Program:
         return jax.vmap(one)(agent, seen, keys)
 
     def _learn(
-        self,
-        learner: Learner,
-        transition: Transition | None,
-        hidden: Int[Array, " seeds"],
-        keys: Key,
-        step: Int[Array, ""],
-        index: int | None,
+        self, learner: Learner, block: Stored, keys: Key, steps: Int[Array, " block"], index: int | None
+    ) -> tuple[Learner, Metrics]:
+        def one(learner: Learner, x: tuple[Stored, Int[Array, ""]]) -> tuple[Learner, Metrics]:
+            (transition, hidden), step = x
+            replay = jax.vmap(functools.partial(ring.append, whole=self._whole))(learner.replay, transition)
+            # else the write is fused into the gathers of `sample`, and the whole replay is copied at every step
+            learner = learner._replace(replay=jax.lax.optimization_barrier(replay))
+            return (learner, {}) if index is None else self._update(learner, hidden, keys, step, index)
+
+        if len(steps) == 1:
+            return one(learner, jax.tree.map(lambda x: x[0], (block, steps)))
+        learner, metrics = jax.lax.scan(one, learner, (block, steps))
+        return learner, jax.tree.map(lambda x: x.mean(0), metrics)
+
+    def _update(
+        self, learner: Learner, hidden: Hidden, keys: Key, step: Int[Array, ""], index: int
     ) -> tuple[Learner, Metrics]:
         agent, replay = learner
-        if transition is not None:
-            replay = jax.vmap(functools.partial(ring.append, whole=self._whole))(replay, transition)
-            # else the write is fused into the gathers of `sample`, and the whole replay is copied at every step
-            replay = jax.lax.optimization_barrier(replay)
-        if index is None:
-            return Learner(agent, replay), {}
         phase = self.phases[index]
         reach = (phase.batch, self._spec.delay, self._agent.ahead(self._spec))
 
@@ -123,7 +113,7 @@ class Program:
                 draw, learn = jax.random.split(key)
                 return phase.update(agent, ring.sample(replay, draw, *reach, hidden), learn, count)
 
-            return jax.vmap(one)(agent, replay, keys, hidden)
+            return jax.vmap(one)(agent, replay, keys, jnp.asarray(hidden))
 
         if phase.updates == 1:
             agent, metrics = update(agent, jnp.int32(0))
@@ -131,22 +121,6 @@ class Program:
             agent, metrics = jax.lax.scan(update, agent, jnp.arange(phase.updates))
             metrics = jax.tree.map(lambda x: x.mean(0), metrics)
         return Learner(agent, replay), metrics
-
-    def _learn_block(
-        self,
-        learner: Learner,
-        transitions: Transition,
-        hidden: Int[Array, "block seeds"],
-        keys: Key,
-        steps: Int[Array, " block"],
-        index: int | None,
-    ) -> tuple[Learner, Metrics]:
-        def one(learner: Learner, x: tuple[Transition, Array, Array]) -> tuple[Learner, Metrics]:
-            transition, hidden, step = x
-            return self._learn(learner, transition, hidden, keys, step, index)
-
-        learner, metrics = jax.lax.scan(one, learner, (transitions, hidden, steps))
-        return learner, jax.tree.map(lambda x: x.mean(0), metrics)
 
 
 compiled = functools.cache(Program)

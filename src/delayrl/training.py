@@ -33,7 +33,7 @@ from delayrl.envs import delay_of, make, physics
 from delayrl.errors import DelayRLError, StoppedError
 from delayrl.estimate import estimate_seconds
 from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, check_seed, reset_seed
-from delayrl.learning import compiled
+from delayrl.learning import Stored, compiled
 from delayrl.plots import curve
 from delayrl.policy import spec_of
 from delayrl.provenance import versions
@@ -146,8 +146,7 @@ class Session:
         self.program = compiled(agent, self.spec, whole(self.spec) if whole else 1)
         self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step, self.learning = 0, False
-        # the newest steps, which the learners have not been given yet, and what `_hidden` said after each
-        self.pending: list[tuple[Transition, NDArray[np.int32]]] = []
+        self.pending: list[Stored] = []  # the newest steps, which the learners have not been given yet
         self.chosen: Any = None  # the next actions, where they have been chosen already
         self.stored: list[dict[str, str]] = [{} for _ in seeds]
         self.stored_until = [(0, 0) for _ in seeds]  # rows and steps of the replay that are in its pieces
@@ -236,7 +235,7 @@ class Session:
         self.learner = self.learner._replace(replay=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays))
         for j in range(len(hidden[0]) if hidden else 0):
             step = jax.tree.map(lambda *x, j=j: np.stack([y[j] for y in x]), *pending)
-            self.pending.append((step, np.array([count[j] for count in hidden], np.int32)))
+            self.pending.append(Stored(step, np.array([count[j] for count in hidden], np.int32)))
         self.chosen = np.stack(chosen) if chosen else None
 
     def save(self, *, complete: bool = False) -> None:
@@ -305,7 +304,7 @@ class Session:
                     metrics |= self._learn()
                 actions, self.chosen = np.asarray(self.chosen), None
                 steps = [actor.step(action) for actor, action in zip(self.actors, actions, strict=True)]
-                self.pending.append((jax.tree.map(lambda *x: np.stack(x), *steps), self._hidden()))
+                self.pending.append(Stored(jax.tree.map(lambda *x: np.stack(x), *steps), self._hidden()))
                 self.step += 1
                 bar.update(1)
                 if self.step % METRICS_EVERY == 0:
@@ -349,10 +348,7 @@ class Session:
             if int(self.learner.replay.steps.min()) < self.spec.delay + 1:
                 raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
         pending, self.pending = self.pending, []
-        if len(pending) == 1:
-            self.learner, new = self.program.learn(self.learner, *pending[0], self.keys, self.step, due[0])
-        else:
-            self.learner, new = self.program.learn_block(self.learner, pending, self.keys, steps, due)
+        self.learner, new = self.program.learn(self.learner, pending, self.keys, steps, due)
         return new
 
     def _random(self) -> NDArray[np.float32]:

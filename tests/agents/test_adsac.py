@@ -14,7 +14,7 @@ from delayrl import replay as ring
 from delayrl.agents.adsac import ADSAC, State
 from delayrl.agents.sac import SAC
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program
+from delayrl.learning import Program, Stored
 from delayrl.types import Seen, Spec, Transition, Window
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
@@ -248,7 +248,9 @@ def test_the_loop_repeats_itself() -> None:
         for step, transition in enumerate(transitions, 1):
             batched = Transition(*(np.asarray(x)[None] for x in transition))
             due = (0,) if step > 30 else ()
-            learner, metrics = program.learn(learner, batched, np.full(1, DELAY, np.int32), keys, step, due)
+            learner, metrics = program.learn(
+                learner, [Stored(batched, np.full(1, DELAY, np.int32))], keys, range(step, step + 1), [due]
+            )
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
         return learner.agent
 

@@ -13,7 +13,7 @@ from delayrl import networks
 from delayrl import replay as ring
 from delayrl.agents.dcac import DCAC, Roll, values
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program
+from delayrl.learning import Program, Stored
 from delayrl.types import Seen, Spec, Window
 from delayrl.views import network_input, view
 
@@ -261,7 +261,9 @@ def test_learning_never_peeks() -> None:
                 transition = transition._replace(**bad, **({"obs": bad["next_obs"]} if step > 38 else {}))
             batch = jax.tree.map(lambda x: np.asarray(x)[None], transition)
             due = (0,) if step == 40 else ()
-            learner, metrics = program.learn(learner, batch, np.full(1, 3, np.int32), keys, step, due)
+            learner, metrics = program.learn(
+                learner, [Stored(batch, np.full(1, 3, np.int32))], keys, range(step, step + 1), [due]
+            )
         assert all(np.isfinite(x).all() for x in metrics.values())
         return jax.device_get(learner.agent)
 

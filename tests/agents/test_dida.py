@@ -13,7 +13,7 @@ from delayrl import replay as ring
 from delayrl.agents.dida import DIDA
 from delayrl.agents.sac import SAC
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program
+from delayrl.learning import Program, Stored
 from delayrl.networks import mode
 from delayrl.types import Seen, Spec, Window
 from delayrl.views import network_input, view
@@ -150,7 +150,9 @@ def test_under_the_loop() -> None:
         for step in range(1, 32):
             due = tuple(i for i, p in enumerate(program.phases) if step > 8 and step % p.every == 0)
             batch = jax.tree.map(lambda *x: np.stack(x), *[steps[step - 1] for steps in data])
-            learner, metrics = program.learn(learner, batch, np.zeros(2, np.int32), keys, step, due)
+            learner, metrics = program.learn(
+                learner, [Stored(batch, np.zeros(2, np.int32))], keys, range(step, step + 1), [due]
+            )
             assert all(np.isfinite(x).all() for x in metrics.values())
             states.append(jax.device_get(learner.agent))
         return states

@@ -16,7 +16,7 @@ from delayrl.agents import lifting
 from delayrl.agents.lifting import Lifting, lifting_loss, moments
 from delayrl.agents.sac import BPQL
 from delayrl.errors import DelayRLError
-from delayrl.learning import compiled
+from delayrl.learning import Stored, compiled
 from delayrl.networks import Gaussian
 from delayrl.types import Seen, Spec, Transition, Window
 from delayrl.views import look
@@ -223,7 +223,9 @@ def run(transitions, hidden: int):
         batched = Transition(*(np.asarray(x)[None] for x in transition))
         due = program.phases[0].every
         last = (0,) if step % due == 0 and step == len(transitions) else ()
-        learner, metrics = program.learn(learner, batched, np.full(1, hidden, np.int32), keys, step, last)
+        learner, metrics = program.learn(
+            learner, [Stored(batched, np.full(1, hidden, np.int32))], keys, range(step, step + 1), [last]
+        )
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
     return learner.agent
 
