@@ -107,6 +107,25 @@ def test_protocol() -> None:
     assert side._process.returncode == 0
 
 
+def test_the_fastest_way_of_a_peer_is_measured() -> None:
+    """Of several processes the fastest stays, and the others end."""
+
+    class Timed:
+        def __init__(self, seconds: float):
+            self.seconds, self.closed = seconds, False
+
+        def slice(self, steps: int) -> dict[str, float]:
+            return {"seconds": self.seconds * steps}
+
+        def close(self) -> None:
+            self.closed = True
+
+    slow, fast = Timed(2), Timed(1)
+    assert run.fastest([slow, fast], 10) is fast
+    assert (slow.closed, fast.closed) == (True, False)
+    assert run.environment(2, "passive")["OMP_WAIT_POLICY"] == "passive"
+
+
 def test_a_side_that_fails_says_why() -> None:
     with pytest.raises(run.MeasurementError, match=r"dummy cannot be measured: .*Nonsense"):
         run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1, "env": "Nonsense-v0"}, threads=1)

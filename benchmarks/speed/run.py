@@ -19,6 +19,9 @@ from works import SIZES, WORKS, Work
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results" / "speed.jsonl"
+WAITING = {kind: ("", "passive") for kind in ("vdpo", "sb3", "cleanrl")}
+"""How OpenMP's threads may wait: as it does by default, spinning for a while, or asleep. On a free machine torch is
+faster with the one, on a busy machine with the other; it is measured with whichever is faster."""
 TIMEOUT = 900
 """Seconds after which a side that says nothing is given up: the first line waits for its compilation."""
 
@@ -30,8 +33,8 @@ class MeasurementError(Exception):
 class Side:
     """A worker process; between its slices it waits."""
 
-    def __init__(self, python: str, side: dict[str, Any], threads: int):
-        self.name, self.side = side["kind"], side
+    def __init__(self, python: str, side: dict[str, Any], threads: int, waiting: str = ""):
+        self.name, self.side, self.waiting = side["kind"], side, waiting
         self._log = HERE / "logs" / f"{side['name']}-{side['kind']}.log"
         self._log.parent.mkdir(exist_ok=True)
         with self._log.open("w") as log:
@@ -41,7 +44,7 @@ class Side:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 text=True,
-                env=environment(threads),
+                env=environment(threads, waiting),
             )
         self.hello = self._read()
 
@@ -77,17 +80,29 @@ class Side:
         return json.loads(line)
 
 
-def environment(threads: int) -> dict[str, str]:
-    """The same for every side: threads, and room for two on one GPU.
+def fastest(sides: list[Side], steps: int) -> Side:
+    """The one of these that is fastest, after three slices of each in turn; the others are closed."""
+    if len(sides) > 1:
+        seconds = [[side.slice(steps)["seconds"] for side in sides] for _ in range(3)]
+        order = np.argsort(np.median(seconds, axis=0))
+        sides = [sides[i] for i in order]
+    for side in sides[1:]:
+        side.close()
+    return sides[0]
 
-    Threads that wait sleep: OpenMP's would spin, which on a machine that others use costs torch ten times its work.
-    """
-    return {"OMP_WAIT_POLICY": "passive", **os.environ} | {
-        "OMP_NUM_THREADS": str(threads),
-        "MKL_NUM_THREADS": str(threads),
-        "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.3",
-        "PYTHONUNBUFFERED": "1",
-    }
+
+def environment(threads: int, waiting: str = "") -> dict[str, str]:
+    """The same for every side: threads, and room for two on one GPU; and how torch's threads wait (`WAITING`)."""
+    return (
+        dict(os.environ)
+        | ({"OMP_WAIT_POLICY": waiting} if waiting else {})
+        | {
+            "OMP_NUM_THREADS": str(threads),
+            "MKL_NUM_THREADS": str(threads),
+            "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.3",
+            "PYTHONUNBUFFERED": "1",
+        }
+    )
 
 
 def quartiles(values: list[float]) -> dict[str, float]:
@@ -130,7 +145,8 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
                 say(f"  {side['kind']} is left out: its environment is not given")
                 continue
             try:
-                open_sides[role] = Side(python, side, args.threads)
+                ways = WAITING.get(side["kind"], ("",)) if args.device == "cpu" else ("",)
+                open_sides[role] = fastest([Side(python, side, args.threads, way) for way in ways], steps)
             except MeasurementError as error:
                 say(f"  {error}")
                 if role == "ours":
@@ -165,6 +181,7 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
     }
     if "peer" in open_sides:
         row["peer"] = summary(sides["peer"], steps, slices["peer"])
+        row["peer"]["waiting"] = open_sides["peer"].waiting or "default"
         row["peer"]["packages"] = open_sides["peer"].hello["packages"]
         row |= ratios(slices["ours"], slices["peer"], sides["ours"]["seeds"], sides["peer"]["seeds"])
     if not args.no_floor:
