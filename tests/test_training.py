@@ -193,6 +193,18 @@ def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_pat
         np.testing.assert_array_equal(array, arrays(whole)[name])
 
 
+def test_threads_change_nothing(tmp_path: Path) -> None:
+    """Two seeds and their evaluations stepped by three threads: rows and parameters of each as ever."""
+    alone = train("vdpo", tmp_path / "alone", seeds=2)
+    beside = train("vdpo", tmp_path / "beside", seeds=2, threads=3)
+    for one, other in zip(alone, beside, strict=True):
+        assert one.read("rows") == other.read("rows")
+        for name, array in arrays(one).items():
+            np.testing.assert_array_equal(array, arrays(other)[name])
+    with pytest.raises(delayrl.DelayRLError, match="threads must be at least 1; got 0"):
+        train("bpql", tmp_path / "run", threads=0)
+
+
 def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match="multiple of updates_per_call; got 100 and 7"):
         train("bpql", tmp_path / "run", updates_per_call=7)

@@ -145,6 +145,7 @@ def _train(arguments: list[str]) -> None:
         "--protocol", choices=["corrected", "official"], default="corrected", help="official: as the released code does"
     )
     parser.add_argument("--track", choices=["tensorboard", "wandb"], help="log there too")
+    parser.add_argument("--threads", type=int, default=1, help="that step the environments (default: 1)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     for title, config in (("schedule", base.schedule), ("hyperparameters", base.agent)):
         group = parser.add_argument_group(f"{title} (preset {preset})")

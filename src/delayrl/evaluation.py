@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,11 +39,21 @@ class Evaluator:
         delay: under which it is played; its maximum must not be longer than `spec.delay`. A text or number for `make`.
         seeds: length of the seed axis of the states.
         episodes: how many for each.
+        apply: `map`, or that of a pool of threads, which steps the environments beside each other.
     """
 
-    def __init__(self, agent: Agent, spec: Spec, env: str, delay: int | str | Delay, seeds: int, episodes: int) -> None:
+    def __init__(
+        self,
+        agent: Agent,
+        spec: Spec,
+        env: str,
+        delay: int | str | Delay,
+        seeds: int,
+        episodes: int,
+        apply: Callable[..., Iterator[Any]] = map,
+    ) -> None:
         late = servable(env, delay, spec)
-        self._delay = spec.delay
+        self._delay, self._apply = spec.delay, apply
         self._envs = [[make(env, late, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
         self._act = _compiled_act(agent)
 
@@ -74,8 +84,9 @@ class Evaluator:
             actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
             actions = first if step == 0 and first is not None else actions
             step += 1
-            for i, j in np.argwhere(running):
-                obs, reward, terminated, truncated, info = self._envs[i][j].step(actions[i, j])
+            alive = [(int(i), int(j)) for i, j in np.argwhere(running)]
+            played = self._apply(self._step, alive, [actions[at] for at in alive])
+            for (i, j), (obs, reward, terminated, truncated, info) in zip(alive, played, strict=True):
                 if not (np.isfinite(reward) and np.isfinite(info["truth"]).all()):
                     raise DelayRLError(
                         "the environment gave a reward or an observation that is not finite in evaluation"
@@ -85,6 +96,9 @@ class Evaluator:
                 running[i, j] = not (terminated or truncated)
                 seen[i][j] = self._see(obs, info)
         return Episodes(returns, lengths)
+
+    def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
+        return self._envs[at[0]][at[1]].step(action)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
         return seen_now(obs, info, self._delay, privileged=False)

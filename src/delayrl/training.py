@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,7 @@ def train(
     overwrite: bool = False,
     protocol: str = "corrected",
     track: str | None = None,
+    threads: int = 1,
     progress: bool = True,
     **values: Any,
 ) -> Any:
@@ -77,6 +79,8 @@ def train(
         overwrite: start afresh where a run exists.
         protocol: "corrected", or "official": the released code's habits (docs/concepts.md).
         track: "tensorboard" or "wandb" as well (extras of the same names).
+        threads: that step the environments, those of the seeds and of evaluation, where simulating is slow. Changes no
+            result.
         progress: show a progress bar and notes on stderr.
         **values: any hyperparameter or schedule option by name.
 
@@ -89,6 +93,8 @@ def train(
     config, schedule = resolve(agent, preset, protocol, values)
     if seeds < 1:
         raise DelayRLError(f"seeds must be at least 1; got {seeds}")
+    if threads < 1:
+        raise DelayRLError(f"threads must be at least 1; got {threads}")
     check_seed(seed)
     check_seed(seed + seeds - 1)
     kind = f"{agent}-{preset}" if protocol == "corrected" else f"{agent}-{preset}-{protocol}"
@@ -103,10 +109,11 @@ def train(
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
-    with on_device(device), jax.default_matmul_precision(schedule.precision):
+    with on_device(device), jax.default_matmul_precision(schedule.precision), ThreadPoolExecutor(threads) as pool:
         official = protocol == "official"
         whole = config.ahead if official and find_agent(agent).drops_last_starts else None
-        session = Session(config, schedule, env, late, [seed + i for i in range(seeds)], official, whole)
+        numbers = [seed + i for i in range(seeds)]
+        session = Session(config, schedule, env, late, numbers, official, whole, pool.map if threads > 1 else map)
         description = {
             "agent": agent,
             "preset": preset,
@@ -134,9 +141,10 @@ class Session:
         seeds: list[int],
         official: bool = False,
         whole: Callable[[Spec], int] | None = None,
+        apply: Callable[..., Iterator[Any]] = map,
     ):
         self.agent, self.schedule, self.env, self.delay, self.seeds = agent, schedule, env, delay, seeds
-        self.official = official
+        self.official, self.apply = official, apply
         self.actors = [
             Actor(make(env, delay.observed(), rescale=True), seed, agent.privileged, official) for seed in seeds
         ]
@@ -303,7 +311,7 @@ class Session:
                 if len(self.pending) == schedule.updates_per_call:
                     metrics |= self._learn()
                 actions, self.chosen = np.asarray(self.chosen), None
-                steps = [actor.step(action) for actor, action in zip(self.actors, actions, strict=True)]
+                steps = list(self.apply(Actor.step, self.actors, actions))
                 self.pending.append(Stored(jax.tree.map(lambda *x: np.stack(x), *steps), self._hidden()))
                 self.step += 1
                 bar.update(1)
@@ -367,10 +375,10 @@ class Session:
 
     def _evaluators(self) -> dict[str, Evaluator]:
         count, episodes = len(self.seeds), self.schedule.evaluation_episodes
-        evaluators = {"agent": Evaluator(self.agent, self.spec, self.env, self.delay, count, episodes)}
+        evaluators = {"agent": Evaluator(self.agent, self.spec, self.env, self.delay, count, episodes, self.apply)}
         if inner := self.agent.reference_policy(self.learner.agent):
             spec = Spec(self.spec.obs_size, self.spec.action_size, 0)
-            evaluators["reference"] = Evaluator(inner[0], spec, self.env, 0, count, episodes)
+            evaluators["reference"] = Evaluator(inner[0], spec, self.env, 0, count, episodes, self.apply)
         return evaluators
 
     def _evaluate(self, evaluators: dict[str, Evaluator], trackers: list[Tracker]) -> str:
