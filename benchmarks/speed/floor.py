@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,13 @@ from gate import pin
 from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
-from delayrl.agents.base import Phase
+from delayrl.agents.base import Agent, Phase
 from delayrl.config import override
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
 from delayrl.policy import spec_of
 from delayrl.training import on_device
-from delayrl.types import Transition
+from delayrl.types import Spec, Transition
 
 ROWS = 2_000
 """Rows of the replay that the parts are timed on; reading it costs the same at any size that exceeds the caches."""
@@ -134,18 +134,34 @@ def filled(spec: Any, rows: int) -> ring.Replay:
     return jax.jit(lambda: jax.lax.scan(lambda r, step: (ring.append(r, step), None), empty, steps)[0])()
 
 
-def parts(side: dict[str, Any]) -> dict[str, Any]:
-    """Seconds of each part of a training step of all seeds, matmul operations of a seed's step, bytes of its replay."""
-    preset = AGENTS[side["agent"]].presets[side["preset"]]
-    agent = override(preset.agent, side["options"])
+class Prepared(NamedTuple):
+    """One side's agent, as it is in training: with a state and a filled replay for each seed."""
+
+    agent: Agent
+    spec: Spec
+    actor: Actor
+    state: Any
+    replay: ring.Replay
+    keys: Any
+
+
+def prepare(side: dict[str, Any]) -> Prepared:
+    """What a side trains, without its loop."""
+    agent = override(AGENTS[side["agent"]].presets[side["preset"]].agent, side["options"])
     delay: Delay = delay_of(side["env"], side["delay"])
     actor = Actor(make(side["env"], delay.observed(), rescale=True), 0, agent.privileged)
     actor.reset()
-    spec, seeds = spec_of(actor.env), side["seeds"]
-    keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+    spec = spec_of(actor.env)
+    keys = jax.vmap(jax.random.key)(jnp.arange(side["seeds"]))
     state = jax.jit(jax.vmap(partial(agent.init, spec)))(keys)
-    one = filled(spec, ROWS)
-    replay = jax.tree.map(lambda x: jnp.stack([x] * seeds), one)
+    replay = jax.tree.map(lambda x: jnp.stack([x] * side["seeds"]), filled(spec, ROWS))
+    return Prepared(agent, spec, actor, state, replay, keys)
+
+
+def parts(side: dict[str, Any]) -> dict[str, Any]:
+    """Seconds of each part of a training step of all seeds, matmul operations of a seed's step, bytes of its replay."""
+    agent, spec, actor, state, replay, keys = prepare(side)
+    seeds, one = side["seeds"], jax.tree.map(lambda x: x[0], replay)
     seen = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * seeds), actor.seen)
 
     act = jax.jit(jax.vmap(partial(agent.act, explore=True)))
@@ -182,20 +198,26 @@ def windows(reach: tuple[int, int, int], replay: ring.Replay, key: Any) -> Any:
     return ring.sample(replay, key, *reach, jnp.int32(0))
 
 
+def update(phase: Phase, reach: tuple[int, int, int], state: Any, replay: ring.Replay, keys: Any, i: Any) -> Any:
+    """The i-th update of all seeds, sampling included: their new states."""
+
+    def one(state: Any, replay: ring.Replay, key: Any) -> Any:
+        draw, learn = jax.random.split(jax.random.fold_in(key, i))
+        return phase.update(state, windows(reach, replay, draw), learn, i)[0]
+
+    return jax.vmap(one)(state, replay, keys)
+
+
 def update_seconds(phase: Phase, reach: tuple[int, int, int], state: Any, replay: ring.Replay, keys: Any) -> float:
     """Of one update of all seeds, sampling included: the mean over both of SAC's turns, or over a short round."""
     count = 2 if phase.updates == 1 else 20
 
-    def one(state: Any, replay: ring.Replay, key: Any, i: Any) -> Any:
-        draw, learn = jax.random.split(jax.random.fold_in(key, i))
-        return phase.update(state, windows(reach, replay, draw), learn, i)[0]
-
     @jax.jit
     def several(state: Any, replay: ring.Replay, keys: Any) -> Any:
-        def update(state: Any, i: Any) -> Any:
-            return jax.vmap(one, in_axes=(0, 0, 0, None))(state, replay, keys, i), None
+        def step(state: Any, i: Any) -> Any:
+            return update(phase, reach, state, replay, keys, i), None
 
-        return jax.lax.scan(update, state, jnp.arange(count))[0]
+        return jax.lax.scan(step, state, jnp.arange(count))[0]
 
     return median_seconds(partial(several, state, replay, keys)) / count
 

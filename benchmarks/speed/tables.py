@@ -118,6 +118,25 @@ def floors(found: list[Row]) -> str:
     return "\n".join([*lines, "", f"The best rate seen: {best / 1e9:.0f} GFLOP/s."])
 
 
+def operations() -> str:
+    """Markdown: one update on one core, by kind of operation."""
+    found = rows("operations")
+    names = {0: "SAC and belief", 1: "cloning"}
+    kinds = sorted(
+        {k for row in found for k in row["kinds"]}, key=lambda k: -max(r["kinds"].get(k, [0])[0] for r in found)
+    )
+    lines = [*head("|".join(["work", "update", "whole, ms", "GFLOP", *(f"{kind}, ms (calls)" for kind in kinds)]))]
+    for row in found:
+        phase = names[row["phase"]] if row["title"].startswith("VDPO") else "SAC"
+        cells = [row["title"], phase, f"{row['milliseconds']:.1f}", f"{row['gflop']:.2f}"]
+        cells += [f"{row['kinds'][k][0]:.2f} ({row['kinds'][k][1]:.0f})" if k in row["kinds"] else "" for k in kinds]
+        lines.append("| " + " | ".join(cells) + " |")
+    commits = ", ".join(sorted({row["versions"]["commit"] or "?" for row in found}))
+    loads = [row["load"] for row in found]
+    lines += ["", f"Commit {commits}; load before each: {min(loads):.1f} to {max(loads):.1f}."] if found else []
+    return "\n".join(lines)
+
+
 def sizes(found: list[Row]) -> str:
     """Markdown: cost against Δ, seeds and task; what was not run stays empty."""
     lines = [
@@ -222,6 +241,7 @@ def pages(root: Path) -> dict[str, str]:
         "speed-resources": resources(found),
         "speed-parts": parts(found),
         "speed-floors": floors(found),
+        "speed-operations": operations(),
         "speed-sizes": sizes(found),
         "speed-memory": memory(),
     }
