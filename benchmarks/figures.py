@@ -13,6 +13,8 @@ matplotlib.use("Agg")
 from matplotlib import pyplot
 from speed import tables as speed
 
+from delayrl.experiments.cli import bench
+
 HERE = Path(__file__).parent
 COLOURS = {
     "vdpo": "#1f6feb",
@@ -212,6 +214,15 @@ def insert(page: Path, key: str, text: str) -> None:
     page.write_text(head + begin + "\n" + text + "\n" + end + rest.split(end)[1])
 
 
+def first(root: Path) -> str:
+    """The report of the grid `first`, into docs/results; of it, what the README shows."""
+    folder = root / "docs" / "results"
+    bench(["report", str(HERE / "results" / "first.sqlite"), "--out", str(folder)])
+    text = (folder / "report.md").read_text()
+    made = next(line for line in text.splitlines() if line.startswith("Made on"))
+    return text[text.index("### Normalised return") : text.index("### Anchors")] + made
+
+
 def main() -> None:
     """Everything that the docs show."""
     root = HERE.parent
@@ -248,6 +259,8 @@ def main() -> None:
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
+    if (HERE / "results" / "first.sqlite").exists():
+        insert(root / "README.md", "first", first(root))
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)
 
