@@ -13,6 +13,7 @@ import pytest
 from support import assert_same_results, bench, finish, tiny, worker_of
 
 import delayrl
+from delayrl.cli import main
 from delayrl.experiments import folders
 from delayrl.experiments.cli import seconds
 from delayrl.experiments.grid import Cell, load_grid
@@ -341,6 +342,15 @@ def test_time_left(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("text", "value"), [("90s", 90), ("9m", 540), ("1h30m", 5400), ("2d", 172800)])
 def test_times(text: str, value: int) -> None:
     assert seconds(text) == value
-    for bad in (text + "x", "", "9", "m"):
+    for bad in (text + "x", "", "9", "m", "0s"):
         with pytest.raises(delayrl.DelayRLError, match="a time is written as"):
             seconds(bad)
+
+
+@pytest.mark.parametrize("option", ["--submit", "--sbatch=--partition=gpu", "--address=auto", "--gpus=1"])
+def test_options_of_another_backend_are_not_ignored(option: str, capsys) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["bench", "run", "smoke", option])
+    assert stopped.value.code == 2
+    name, backend = option.split("=")[0], "slurm" if option.startswith("--s") else "ray"
+    assert capsys.readouterr().err.strip() == f"delayrl: {name} needs --backend {backend}; got --backend local"

@@ -131,6 +131,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     cells = _chosen(grid, given.cells)
     _at_least_one("--tries", given.tries)
     _at_least_one("--workers", given.workers)
+    _check_backend(given)
     _claim(grid, given, look=False)
     if given.backend == "slurm":
         _slurm(grid, cells, given)
@@ -192,6 +193,15 @@ def _chosen(grid: Grid, ids: list[str] | None) -> list[Cell]:
     return [cell for cell in grid.cells if cell.id in ids]
 
 
+def _check_backend(given: argparse.Namespace) -> None:
+    """DelayRLError for an option that the chosen backend does not have: it would be ignored in silence."""
+    nothing: dict[str, Any] = {"sbatch": [], "submit": False, "address": None, "cpus": 1.0, "gpus": 0.0}
+    for backend, names in {"slurm": ("sbatch", "submit"), "ray": ("address", "cpus", "gpus")}.items():
+        for name in names:
+            if given.backend != backend and getattr(given, name) != nothing[name]:
+                raise DelayRLError(f"--{name} needs --backend {backend}; got --backend {given.backend}")
+
+
 def _at_least_one(name: str, value: int | None) -> None:
     if value is not None and value < 1:
         raise DelayRLError(f"{name} must be at least 1; got {value}")
@@ -200,9 +210,11 @@ def _at_least_one(name: str, value: int | None) -> None:
 def seconds(text: str) -> float:
     """A time such as 90s, 9m, 1h30m or 2d, in seconds."""
     parts = re.fullmatch(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
-    if not parts or not any(parts.groups()):
-        raise DelayRLError(f"a time is written as 90s, 9m, 1h30m or 2d; got {text!r}")
-    return sum(int(n or 0) * unit for n, unit in zip(parts.groups(), (86400, 3600, 60, 1), strict=True))
+    units = (86400, 3600, 60, 1)
+    total = sum(int(n or 0) * unit for n, unit in zip(parts.groups(), units, strict=True)) if parts else 0
+    if not total:
+        raise DelayRLError(f"a time is written as 90s, 9m, 1h30m or 2d, and is longer than nothing; got {text!r}")
+    return total
 
 
 @contextmanager
