@@ -210,6 +210,12 @@ def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
         train("bpql", tmp_path / "run", updates_per_call=7)
 
 
+def test_a_block_may_begin_before_learning_does(tmp_path: Path) -> None:
+    """Its own random steps are there to learn from."""
+    run = train("bpql", tmp_path / "run", random_steps=50, updates_per_call=100)
+    assert run.latest().complete
+
+
 def test_runs_from_before_an_option_go_on(tmp_path: Path) -> None:
     """A schedule that says nothing of an option means its default."""
     run = train("random", tmp_path / "run")

@@ -351,12 +351,12 @@ class Session:
             return {}
         steps = range(self.step - len(self.pending) + 1, self.step + 1)
         due = [self.program.due(step, self.schedule) for step in steps]
-        if any(due) and not self.learning:
-            self.learning = True
-            if int(self.learner.replay.steps.min()) < self.spec.delay + 1:
-                raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
         pending, self.pending = self.pending, []
         self.learner, new = self.program.learn(self.learner, pending, self.keys, steps, due)
+        if any(due) and not self.learning:
+            self.learning = True
+            if int(self.learner.replay.steps.min()) < self.spec.delay + 1:  # the first block's own steps count too
+                raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
         return new
 
     def _random(self) -> NDArray[np.float32]:
