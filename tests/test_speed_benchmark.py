@@ -73,6 +73,16 @@ def test_amortised() -> None:
     assert floor.amortised([(1, 2, 0.01), (250, 500, 0.02)]) == pytest.approx(0.06)
 
 
+def test_floor_multiplies_as_training_does(monkeypatch, capsys) -> None:
+    """In the run's precision, not in the device's: a GPU's own is coarser, and faster."""
+    monkeypatch.setattr(floor, "pin", lambda: None)
+    monkeypatch.setattr(floor, "parts", lambda side: jax.config.jax_default_matmul_precision)
+    for options, words in (({}, '"float32"'), ({"precision": "bfloat16"}, '"BF16_BF16_F32"')):
+        monkeypatch.setattr(sys, "argv", ["floor.py", json.dumps({"device": "cpu", "options": options})])
+        floor.main()
+        assert capsys.readouterr().out.strip() == words
+
+
 def test_replay_bytes() -> None:
     """The table's formula is what our replay takes; the released code's is counted by its columns."""
     for sizes in ((17, 6, 5), (348, 17, 50)):

@@ -15,7 +15,8 @@ from delayrl.agents import AGENTS
 from delayrl.config import override, values_of
 from delayrl.delays import as_delay
 from delayrl.envs import make
-from delayrl.evaluation import evaluate
+from delayrl.evaluation import Evaluator, evaluate
+from delayrl.learning import Program
 from delayrl.runs import Run
 from delayrl.training import Session
 
@@ -203,6 +204,52 @@ def test_threads_change_nothing(tmp_path: Path) -> None:
             np.testing.assert_array_equal(array, arrays(other)[name])
     with pytest.raises(delayrl.DelayRLError, match="threads must be at least 1; got 0"):
         train("bpql", tmp_path / "run", threads=0)
+
+
+@pytest.mark.parametrize(
+    ("precision", "words"),
+    [
+        ("float32", "precision = [HIGHEST, HIGHEST]"),
+        ("bfloat16", "lhs_precision_type = bf16, rhs_precision_type = bf16, accumulation_type = f32"),
+    ],
+)
+def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, monkeypatch) -> None:
+    """As it is lowered for a GPU: learning, acting and evaluating, in one process after runs of other precisions."""
+    lowered: list[str] = []
+    learn, act, played = Program.learn, Program.act, Evaluator.__call__
+
+    def products(function, *args, **options) -> None:
+        text = function.trace(*args, **options).lower(lowering_platforms=("cuda",)).as_text()
+        lowered.extend(line for line in text.splitlines() if "dot_general" in line)
+
+    def learning(self, learner, stored, keys, steps, due):
+        for index in range(len(self.phases)) if steps[-1] == 100 else ():
+            products(self._jitted_update, learner, stored[-1].hidden, keys, np.int32(1), index=index)
+        return learn(self, learner, stored, keys, steps, due)
+
+    def acting(self, agent, seen, keys, step):
+        products(self._jitted_act, agent, seen, keys, np.int32(step)) if step == 100 else None
+        return act(self, agent, seen, keys, step)
+
+    def evaluating(self, states, *args):
+        inner = self._act
+
+        def watched(*args):
+            products(inner, *args) if int(args[-1]) == 0 else None
+            return inner(*args)
+
+        monkeypatch.setattr(self, "_act", watched)
+        result = played(self, states, *args)
+        monkeypatch.setattr(self, "_act", inner)
+        return result
+
+    monkeypatch.setattr(Program, "learn", learning)
+    monkeypatch.setattr(Program, "act", acting)
+    monkeypatch.setattr(Evaluator, "__call__", evaluating)
+    run = train("bpql", tmp_path / "run", steps=101, precision=precision)
+    assert len(run.read("rows")) == 4
+    assert len(lowered) > 30
+    assert all(words in line for line in lowered)
 
 
 def test_blocks_end_at_evaluations(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from gate import pin
 from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
-from delayrl.agents.base import Agent, Phase
+from delayrl.agents.base import PRODUCTS, Agent, Phase
 from delayrl.config import override
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
@@ -231,7 +231,10 @@ def replay_bytes(spec: Any, capacity: int) -> int:
 def main() -> None:
     pin()
     side = json.loads(sys.argv[1])
-    with on_device(side["device"]):
+    precision = side["options"].get(
+        "precision", "float32"
+    )  # else the products of a GPU would be coarser than training's
+    with on_device(side["device"]), jax.default_matmul_precision(PRODUCTS[precision]):
         print(json.dumps(parts(side)))
 
 
