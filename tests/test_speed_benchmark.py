@@ -117,7 +117,7 @@ def test_protocol() -> None:
     assert side._process.returncode == 0
 
 
-def test_the_fastest_way_of_a_peer_is_measured() -> None:
+def test_the_fastest_way_of_a_peer_is_measured(monkeypatch) -> None:
     """Of several processes the fastest stays, and the others end."""
 
     class Timed:
@@ -133,12 +133,61 @@ def test_the_fastest_way_of_a_peer_is_measured() -> None:
     slow, fast = Timed(2), Timed(1)
     assert run.fastest([slow, fast], 10) is fast
     assert (slow.closed, fast.closed) == (True, False)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     assert run.environment(2, "passive")["OMP_WAIT_POLICY"] == "passive"
+    assert "OMP_WAIT_POLICY" not in run.environment(2)
+
+
+def test_a_side_that_fails_leaves_none_behind(monkeypatch) -> None:
+    """Started in two ways: where the second fails, at its start or later, the first ends too."""
+    left = set()
+
+    class Failing:
+        def __init__(self, python: str, side: dict, threads: int, waiting: str):
+            if waiting == "fails at once":
+                raise run.MeasurementError
+            self.waiting = waiting
+            left.add(waiting)
+
+        def slice(self, steps: int) -> dict[str, float]:
+            if self.waiting:
+                raise run.MeasurementError
+            return {"seconds": 1.0}
+
+        def close(self) -> None:
+            left.remove(self.waiting)
+
+    monkeypatch.setattr(run, "Side", Failing)
+    for way in ("fails at once", "fails later"):
+        with pytest.raises(run.MeasurementError):
+            run.start("python", DUMMY, 1, ("", way), 10)
+        assert not left
+
+
+def test_a_side_that_is_killed_says_so() -> None:
+    """By the kernel, for memory, while the other side works."""
+    side = run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1}, threads=1)
+    side._process.kill()
+    side._process.wait()
+    with pytest.raises(run.MeasurementError, match="dummy cannot be measured"):
+        side.slice(10)
+    side.close()
 
 
 def test_a_side_that_fails_says_why() -> None:
-    with pytest.raises(run.MeasurementError, match=r"dummy cannot be measured: .*Nonsense"):
-        run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1, "env": "Nonsense-v0"}, threads=1)
+    words = r"dummy cannot be measured: .*Nonsense.*test-dummy-1-passive\.log"
+    with pytest.raises(run.MeasurementError, match=words):
+        run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1, "env": "Nonsense-v0"}, 1, "passive")
+
+
+def test_what_could_not_be_measured_is_no_success(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Here there is no GPU: one line, no row, and a status."""
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    out = tmp_path / "rows.jsonl"
+    monkeypatch.setattr(sys, "argv", ["run.py", "vdpo-5", "--device", "gpu", "--out", str(out)])
+    assert run.main() == 2
+    assert "JAX finds no gpu" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
