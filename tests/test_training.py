@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ from delayrl.delays import as_delay
 from delayrl.envs import make
 from delayrl.evaluation import Evaluator, evaluate
 from delayrl.learning import Program
+from delayrl.provenance import versions
 from delayrl.runs import Run
 from delayrl.training import Session
 
@@ -250,6 +252,14 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
     assert len(run.read("rows")) == 4
     assert len(lowered) > 30
     assert all(words in line for line in lowered)
+
+
+def test_the_device_that_is_written_down_is_the_one_in_use(monkeypatch) -> None:
+    """`--device cpu` where there is a GPU too."""
+    cpu = jax.devices("cpu")[0]
+    monkeypatch.setattr(jax, "devices", lambda *_: [SimpleNamespace(device_kind="GPU")])
+    with jax.default_device(cpu):
+        assert versions()["device"] == "cpu"
 
 
 def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
