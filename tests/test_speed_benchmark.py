@@ -228,5 +228,12 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
     assert "ratio 0.50" in tables.behind([slow])
     assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
+    gpu = json.loads(json.dumps(works[0] | {"device": "gpu"}))
+    gpu["versions"] |= {"device": "Some GPU", "cores": 123}
+    cpu, other = tables.provenance([*rows, gpu]).split("\n\n")
+    assert cpu == tables.provenance(rows)
+    assert "123 x86 cores (Some GPU)" in other
+    assert tables.spent(gpu) == gpu["ours"]["seconds"]["median"]  # its floor is the GPU's, not the processor's
+    assert tables.spent(works[0]) == works[0]["ours"]["processor"]["median"] / works[0]["threads"]
     tables.draw_sizes(rows, tmp_path / "sizes.png")
     assert (tmp_path / "sizes.png").stat().st_size > 5000
