@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "speed")]
 
 import floor  # noqa: E402
 import run  # noqa: E402
+import worker  # noqa: E402
 from speed import tables  # noqa: E402
 from works import SIZES, WORKS, Work  # noqa: E402
 
@@ -201,6 +203,29 @@ def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
         (names[1], "cpu", 2),
         (names[1], "gpu", 1),
     ]
+
+
+def test_no_works_is_no_success(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["run.py", "--sizes", "--device", "gpu"])
+    assert run.main() == 2
+    assert "no such works of gpu" in capsys.readouterr().err
+
+
+def test_sbx_is_on_the_device_that_is_asked_for(monkeypatch) -> None:
+    """It would take the GPU where ours is measured on the CPU."""
+    seen = []
+
+    class Peer:
+        def __init__(self, *_: object, **options: object):
+            seen.append(jax.config.jax_default_device)
+
+        def learn(self, steps: int) -> None:
+            seen.append(jax.config.jax_default_device)
+
+    monkeypatch.setitem(sys.modules, "sbx", SimpleNamespace(SAC=Peer))
+    monkeypatch.setattr(worker, "register", lambda gate, task: task)
+    worker.sbx(DUMMY, None)
+    assert seen == [jax.devices("cpu")[0]] * 2
 
 
 def test_both_sides_clone_once_a_slice() -> None:

@@ -335,6 +335,9 @@ def main() -> int:
             say(f"{name}: {path} is no folder; give a checkout")
             return 2
     chosen = args.works or [w.name for w in (SIZES if args.sizes else WORKS).values() if args.device in w.steps]
+    if not chosen:
+        say(f"there are no such works of {args.device}; name some, and give --steps")
+        return 2
     if elsewhere := [name for name in chosen if not args.steps and args.device not in known[name].steps]:
         say(f"{', '.join(elsewhere)} has no slice length for {args.device}; give --steps")
         return 2
