@@ -205,6 +205,14 @@ def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
     ]
 
 
+def test_other_hyperparameters_are_not_published(monkeypatch, capsys) -> None:
+    """A row's title does not say them."""
+    monkeypatch.setattr(sys, "argv", ["run.py", "vdpo-64", "--set", "width=8"])
+    monkeypatch.setattr(run, "compare", lambda *_: pytest.fail("measured"))
+    assert run.main() == 2
+    assert "give --out" in capsys.readouterr().err
+
+
 def test_no_works_is_no_success(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["run.py", "--sizes", "--device", "gpu"])
     assert run.main() == 2

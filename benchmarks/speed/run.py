@@ -334,6 +334,9 @@ def main() -> int:
         if path and not Path(path).is_dir():
             say(f"{name}: {path} is no folder; give a checkout")
             return 2
+    if args.set and args.out == RESULTS:
+        say("--set measures another work than the table says: give --out, a file of its own")
+        return 2
     chosen = args.works or [w.name for w in (SIZES if args.sizes else WORKS).values() if args.device in w.steps]
     if not chosen:
         say(f"there are no such works of {args.device}; name some, and give --steps")
