@@ -254,6 +254,19 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
     assert all(words in line for line in lowered)
 
 
+def test_a_policy_is_evaluated_in_single_precision(vdpo: Run, monkeypatch) -> None:
+    """`evaluate` too, where a GPU would multiply more coarsely."""
+    played, found = Evaluator.__call__, []
+
+    def watched(self, *args):
+        found.append(jax.config.jax_default_matmul_precision)
+        return played(self, *args)
+
+    monkeypatch.setattr(Evaluator, "__call__", watched)
+    evaluate(vdpo.path, 1)
+    assert found == ["float32"]
+
+
 def test_the_device_that_is_written_down_is_the_one_in_use(monkeypatch) -> None:
     """`--device cpu` where there is a GPU too."""
     cpu = jax.devices("cpu")[0]
