@@ -205,6 +205,17 @@ def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(["--torch-python", "nowhere/python"], "is no Python"), (["--out", "nowhere/rows"], "no folder")],
+)
+def test_what_is_not_there_is_said_before_anything_is_measured(words, said, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["run.py", "sac-sb3", *words])
+    monkeypatch.setattr(run, "compare", lambda *_: pytest.fail("measured"))
+    assert run.main() == 2
+    assert said in capsys.readouterr().err
+
+
 def test_other_hyperparameters_are_not_published(monkeypatch, capsys) -> None:
     """A row's title does not say them."""
     monkeypatch.setattr(sys, "argv", ["run.py", "vdpo-64", "--set", "width=8"])

@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import select
+import shutil
 import subprocess
 import sys
 import time
@@ -334,6 +335,13 @@ def main() -> int:
         if path and not Path(path).is_dir():
             say(f"{name}: {path} is no folder; give a checkout")
             return 2
+    for name, python in (("--torch-python", args.torch_python), ("--jax-python", args.jax_python)):
+        if python and not shutil.which(python):
+            say(f"{name}: {python} is no Python that can be started")
+            return 2
+    if not args.out.parent.is_dir():
+        say(f"--out: there is no folder {args.out.parent}")
+        return 2
     if args.set and args.out == RESULTS:
         say("--set measures another work than the table says: give --out, a file of its own")
         return 2
