@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "speed")]
 
 import floor  # noqa: E402
 import run  # noqa: E402
+import worker  # noqa: E402
 from speed import tables  # noqa: E402
 from works import SIZES, WORKS, Work  # noqa: E402
 
@@ -73,6 +75,16 @@ def test_amortised() -> None:
     assert floor.amortised([(1, 2, 0.01), (250, 500, 0.02)]) == pytest.approx(0.06)
 
 
+def test_floor_multiplies_as_training_does(monkeypatch, capsys) -> None:
+    """In the run's precision, not in the device's: a GPU's own is coarser, and faster."""
+    monkeypatch.setattr(floor, "pin", lambda: None)
+    monkeypatch.setattr(floor, "parts", lambda side: jax.config.jax_default_matmul_precision)
+    for options, words in (({}, '"float32"'), ({"precision": "bfloat16"}, '"BF16_BF16_F32"')):
+        monkeypatch.setattr(sys, "argv", ["floor.py", json.dumps({"device": "cpu", "options": options})])
+        floor.main()
+        assert capsys.readouterr().out.strip() == words
+
+
 def test_replay_bytes() -> None:
     """The table's formula is what our replay takes; the released code's is counted by its columns."""
     for sizes in ((17, 6, 5), (348, 17, 50)):
@@ -107,7 +119,7 @@ def test_protocol() -> None:
     assert side._process.returncode == 0
 
 
-def test_the_fastest_way_of_a_peer_is_measured() -> None:
+def test_the_fastest_way_of_a_peer_is_measured(monkeypatch) -> None:
     """Of several processes the fastest stays, and the others end."""
 
     class Timed:
@@ -123,12 +135,61 @@ def test_the_fastest_way_of_a_peer_is_measured() -> None:
     slow, fast = Timed(2), Timed(1)
     assert run.fastest([slow, fast], 10) is fast
     assert (slow.closed, fast.closed) == (True, False)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     assert run.environment(2, "passive")["OMP_WAIT_POLICY"] == "passive"
+    assert "OMP_WAIT_POLICY" not in run.environment(2)
+
+
+def test_a_side_that_fails_leaves_none_behind(monkeypatch) -> None:
+    """Started in two ways: where the second fails, at its start or later, the first ends too."""
+    left = set()
+
+    class Failing:
+        def __init__(self, python: str, side: dict, threads: int, waiting: str):
+            if waiting == "fails at once":
+                raise run.MeasurementError
+            self.waiting = waiting
+            left.add(waiting)
+
+        def slice(self, steps: int) -> dict[str, float]:
+            if self.waiting:
+                raise run.MeasurementError
+            return {"seconds": 1.0}
+
+        def close(self) -> None:
+            left.remove(self.waiting)
+
+    monkeypatch.setattr(run, "Side", Failing)
+    for way in ("fails at once", "fails later"):
+        with pytest.raises(run.MeasurementError):
+            run.start("python", DUMMY, 1, ("", way), 10)
+        assert not left
+
+
+def test_a_side_that_is_killed_says_so() -> None:
+    """By the kernel, for memory, while the other side works."""
+    side = run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1}, threads=1)
+    side._process.kill()
+    side._process.wait()
+    with pytest.raises(run.MeasurementError, match="dummy cannot be measured"):
+        side.slice(10)
+    side.close()
 
 
 def test_a_side_that_fails_says_why() -> None:
-    with pytest.raises(run.MeasurementError, match=r"dummy cannot be measured: .*Nonsense"):
-        run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1, "env": "Nonsense-v0"}, threads=1)
+    words = r"dummy cannot be measured: .*Nonsense.*test-dummy-1-passive\.log"
+    with pytest.raises(run.MeasurementError, match=words):
+        run.Side(sys.executable, DUMMY | {"name": "test", "warmup": 1, "env": "Nonsense-v0"}, 1, "passive")
+
+
+def test_what_could_not_be_measured_is_no_success(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Here there is no GPU: one line, no row, and a status."""
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    out = tmp_path / "rows.jsonl"
+    monkeypatch.setattr(sys, "argv", ["run.py", "vdpo-5", "--device", "gpu", "--out", str(out)])
+    assert run.main() == 2
+    assert "JAX finds no gpu" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
@@ -142,6 +203,48 @@ def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
         (names[1], "cpu", 2),
         (names[1], "gpu", 1),
     ]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(["--torch-python", "nowhere/python"], "is no Python"), (["--out", "nowhere/rows"], "no folder")],
+)
+def test_what_is_not_there_is_said_before_anything_is_measured(words, said, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["run.py", "sac-sb3", *words])
+    monkeypatch.setattr(run, "compare", lambda *_: pytest.fail("measured"))
+    assert run.main() == 2
+    assert said in capsys.readouterr().err
+
+
+def test_other_hyperparameters_are_not_published(monkeypatch, capsys) -> None:
+    """A row's title does not say them."""
+    monkeypatch.setattr(sys, "argv", ["run.py", "vdpo-64", "--set", "width=8"])
+    monkeypatch.setattr(run, "compare", lambda *_: pytest.fail("measured"))
+    assert run.main() == 2
+    assert "give --out" in capsys.readouterr().err
+
+
+def test_no_works_is_no_success(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["run.py", "--sizes", "--device", "gpu"])
+    assert run.main() == 2
+    assert "no such works of gpu" in capsys.readouterr().err
+
+
+def test_sbx_is_on_the_device_that_is_asked_for(monkeypatch) -> None:
+    """It would take the GPU where ours is measured on the CPU."""
+    seen = []
+
+    class Peer:
+        def __init__(self, *_: object, **options: object):
+            seen.append(jax.config.jax_default_device)
+
+        def learn(self, steps: int) -> None:
+            seen.append(jax.config.jax_default_device)
+
+    monkeypatch.setitem(sys.modules, "sbx", SimpleNamespace(SAC=Peer))
+    monkeypatch.setattr(worker, "register", lambda gate, task: task)
+    worker.sbx(DUMMY, None)
+    assert seen == [jax.devices("cpu")[0]] * 2
 
 
 def test_both_sides_clone_once_a_slice() -> None:
@@ -169,5 +272,12 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
     assert "ratio 0.50" in tables.behind([slow])
     assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
+    gpu = json.loads(json.dumps(works[0] | {"device": "gpu"}))
+    gpu["versions"] |= {"device": "Some GPU", "cores": 123}
+    cpu, other = tables.provenance([*rows, gpu]).split("\n\n")
+    assert cpu == tables.provenance(rows)
+    assert "123 x86 cores (Some GPU)" in other
+    assert tables.spent(gpu) == gpu["ours"]["seconds"]["median"]  # its floor is the GPU's, not the processor's
+    assert tables.spent(works[0]) == works[0]["ours"]["processor"]["median"] / works[0]["threads"]
     tables.draw_sizes(rows, tmp_path / "sizes.png")
     assert (tmp_path / "sizes.png").stat().st_size > 5000

@@ -4,6 +4,7 @@ import json
 import shutil
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -15,7 +16,9 @@ from delayrl.agents import AGENTS
 from delayrl.config import override, values_of
 from delayrl.delays import as_delay
 from delayrl.envs import make
-from delayrl.evaluation import evaluate
+from delayrl.evaluation import Evaluator, evaluate
+from delayrl.learning import Program
+from delayrl.provenance import versions
 from delayrl.runs import Run
 from delayrl.training import Session
 
@@ -205,9 +208,82 @@ def test_threads_change_nothing(tmp_path: Path) -> None:
         train("bpql", tmp_path / "run", threads=0)
 
 
+@pytest.mark.parametrize(
+    ("precision", "words"),
+    [
+        ("float32", "precision = [HIGHEST, HIGHEST]"),
+        ("bfloat16", "lhs_precision_type = bf16, rhs_precision_type = bf16, accumulation_type = f32"),
+    ],
+)
+def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, monkeypatch) -> None:
+    """As it is lowered for a GPU: learning, acting and evaluating, in one process after runs of other precisions."""
+    lowered: list[str] = []
+    learn, act, played = Program.learn, Program.act, Evaluator.__call__
+
+    def products(function, *args, **options) -> None:
+        text = function.trace(*args, **options).lower(lowering_platforms=("cuda",)).as_text()
+        lowered.extend(line for line in text.splitlines() if "dot_general" in line)
+
+    def learning(self, learner, stored, keys, steps, due):
+        for index in range(len(self.phases)) if steps[-1] == 100 else ():
+            products(self._jitted_update, learner, stored[-1].hidden, keys, np.int32(1), index=index)
+        return learn(self, learner, stored, keys, steps, due)
+
+    def acting(self, agent, seen, keys, step):
+        products(self._jitted_act, agent, seen, keys, np.int32(step)) if step == 100 else None
+        return act(self, agent, seen, keys, step)
+
+    def evaluating(self, states, *args):
+        inner = self._act
+
+        def watched(*args):
+            products(inner, *args) if int(args[-1]) == 0 else None
+            return inner(*args)
+
+        monkeypatch.setattr(self, "_act", watched)
+        result = played(self, states, *args)
+        monkeypatch.setattr(self, "_act", inner)
+        return result
+
+    monkeypatch.setattr(Program, "learn", learning)
+    monkeypatch.setattr(Program, "act", acting)
+    monkeypatch.setattr(Evaluator, "__call__", evaluating)
+    run = train("bpql", tmp_path / "run", steps=101, precision=precision)
+    assert len(run.read("rows")) == 4
+    assert len(lowered) > 30
+    assert all(words in line for line in lowered)
+
+
+def test_a_policy_is_evaluated_in_single_precision(vdpo: Run, monkeypatch) -> None:
+    """`evaluate` too, where a GPU would multiply more coarsely."""
+    played, found = Evaluator.__call__, []
+
+    def watched(self, *args):
+        found.append(jax.config.jax_default_matmul_precision)
+        return played(self, *args)
+
+    monkeypatch.setattr(Evaluator, "__call__", watched)
+    evaluate(vdpo.path, 1)
+    assert found == ["float32"]
+
+
+def test_the_device_that_is_written_down_is_the_one_in_use(monkeypatch) -> None:
+    """`--device cpu` where there is a GPU too."""
+    cpu = jax.devices("cpu")[0]
+    monkeypatch.setattr(jax, "devices", lambda *_: [SimpleNamespace(device_kind="GPU")])
+    with jax.default_device(cpu):
+        assert versions()["device"] == "cpu"
+
+
 def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match="multiple of updates_per_call; got 100 and 7"):
         train("bpql", tmp_path / "run", updates_per_call=7)
+
+
+def test_a_block_may_begin_before_learning_does(tmp_path: Path) -> None:
+    """Its own random steps are there to learn from."""
+    run = train("bpql", tmp_path / "run", random_steps=50, updates_per_call=100)
+    assert run.latest().complete
 
 
 def test_runs_from_before_an_option_go_on(tmp_path: Path) -> None:

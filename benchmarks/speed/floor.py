@@ -21,7 +21,7 @@ from gate import pin
 from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
-from delayrl.agents.base import Agent, Phase
+from delayrl.agents.base import PRODUCTS, Agent, Phase
 from delayrl.config import override
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
@@ -100,11 +100,15 @@ def rate(left: tuple[int, int], right: tuple[int, int], transposed: str = "", se
     return size / best
 
 
-def rates(rows: int, width: int) -> dict[str, float]:
+SQUARES = {"cpu": (512, 1024, 2048), "gpu": (2048, 4096, 8192)}
+"""Large enough for the device's best rate: of small ones a GPU has done before the next is called."""
+
+
+def rates(rows: int, width: int, device: str) -> dict[str, float]:
     """Of squares; and forward, for the weights' gradient and for the inputs', in a square layer of an update."""
     x, w = (rows, width), (width, width)
     return {
-        "square": max(rate((size, size), (size, size)) for size in (512, 1024, 2048)),
+        "square": max(rate((size, size), (size, size)) for size in SQUARES[device]),
         "forward": rate(x, w),
         "weights": rate(x, x, "left"),
         "inputs": rate(x, w, "right"),
@@ -186,7 +190,7 @@ def parts(side: dict[str, Any]) -> dict[str, Any]:
     return {
         "parts": found,
         "flops": flops,
-        "rates": rates(rows, getattr(agent, "width", 256)),
+        "rates": rates(rows, getattr(agent, "width", 256), side["device"]),
         "obs_size": spec.obs_size,
         "replay_bytes": replay_bytes(spec, capacity),
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
@@ -231,7 +235,10 @@ def replay_bytes(spec: Any, capacity: int) -> int:
 def main() -> None:
     pin()
     side = json.loads(sys.argv[1])
-    with on_device(side["device"]):
+    precision = side["options"].get(
+        "precision", "float32"
+    )  # else the products of a GPU would be coarser than training's
+    with on_device(side["device"]), jax.default_matmul_precision(PRODUCTS[precision]):
         print(json.dumps(parts(side)))
 
 

@@ -5,9 +5,11 @@ Tables and pictures are made of it by benchmarks/figures.py.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import select
+import shutil
 import subprocess
 import sys
 import time
@@ -35,7 +37,8 @@ class Side:
 
     def __init__(self, python: str, side: dict[str, Any], threads: int, waiting: str = ""):
         self.name, self.side, self.waiting = side["kind"], side, waiting
-        self._log = HERE / "logs" / f"{side['name']}-{side['kind']}.log"
+        words = (side["name"], side["kind"], str(side["seeds"]), waiting)
+        self._log = HERE / "logs" / ("-".join(word for word in words if word) + ".log")
         self._log.parent.mkdir(exist_ok=True)
         with self._log.open("w") as log:
             self._process = subprocess.Popen(
@@ -51,15 +54,17 @@ class Side:
     def slice(self, steps: int) -> dict[str, Any]:
         """Train so many steps of every seed; the report."""
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps({"steps": steps * self.side["seeds"]}) + "\n")
-        self._process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):  # it has been killed: `_read` says so
+            self._process.stdin.write(json.dumps({"steps": steps * self.side["seeds"]}) + "\n")
+            self._process.stdin.flush()
         return self._read()
 
     def close(self) -> None:
         """Stop it, politely first."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
         try:
             self._process.wait(20)
         except subprocess.TimeoutExpired:
@@ -80,6 +85,19 @@ class Side:
         return json.loads(line)
 
 
+def start(python: str, side: dict[str, Any], threads: int, ways: tuple[str, ...], steps: int) -> Side:
+    """A side in the way of waiting in which it is fastest. Where one fails, none is left."""
+    sides: list[Side] = []
+    try:
+        for way in ways:
+            sides.append(Side(python, side, threads, way))
+        return fastest(sides, steps)
+    except BaseException:
+        for other in sides:
+            other.close()
+        raise
+
+
 def fastest(sides: list[Side], steps: int) -> Side:
     """The one of these that is fastest, after three slices of each in turn; the others are closed."""
     if len(sides) > 1:
@@ -94,7 +112,7 @@ def fastest(sides: list[Side], steps: int) -> Side:
 def environment(threads: int, waiting: str = "") -> dict[str, str]:
     """The same for every side: threads, and room for two on one GPU; and how torch's threads wait (`WAITING`)."""
     return (
-        dict(os.environ)
+        {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
         | ({"OMP_WAIT_POLICY": waiting} if waiting else {})
         | {
             "OMP_NUM_THREADS": str(threads),
@@ -146,7 +164,7 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
                 continue
             try:
                 ways = WAITING.get(side["kind"], ("",)) if args.device == "cpu" else ("",)
-                open_sides[role] = fastest([Side(python, side, args.threads, way) for way in ways], steps)
+                open_sides[role] = start(python, side, args.threads, ways, steps)
             except MeasurementError as error:
                 say(f"  {error}")
                 if role == "ours":
@@ -317,11 +335,24 @@ def main() -> int:
         if path and not Path(path).is_dir():
             say(f"{name}: {path} is no folder; give a checkout")
             return 2
+    for name, python in (("--torch-python", args.torch_python), ("--jax-python", args.jax_python)):
+        if python and not shutil.which(python):
+            say(f"{name}: {python} is no Python that can be started")
+            return 2
+    if not args.out.parent.is_dir():
+        say(f"--out: there is no folder {args.out.parent}")
+        return 2
+    if args.set and args.out == RESULTS:
+        say("--set measures another work than the table says: give --out, a file of its own")
+        return 2
     chosen = args.works or [w.name for w in (SIZES if args.sizes else WORKS).values() if args.device in w.steps]
+    if not chosen:
+        say(f"there are no such works of {args.device}; name some, and give --steps")
+        return 2
     if elsewhere := [name for name in chosen if not args.steps and args.device not in known[name].steps]:
         say(f"{', '.join(elsewhere)} has no slice length for {args.device}; give --steps")
         return 2
-    began = time.perf_counter()
+    began, status = time.perf_counter(), 0
     for number, name in enumerate(chosen):
         gone = time.perf_counter() - began
         left = f", about {gone / number * (len(chosen) - number) / 60:.0f} min left" if number else ""
@@ -330,11 +361,13 @@ def main() -> int:
             row = compare(known[name], args)
         except MeasurementError as error:
             say(f"  {error}")
-            continue
+            row = None
         if row:
             write(row, args.out)
             say(report(row))
-    return 0
+        else:
+            status = 2
+    return status
 
 
 if __name__ == "__main__":

@@ -45,8 +45,9 @@ def behind(found: list[Row]) -> str:
             names = {"phase 0": "SAC and belief", "phase 1": "cloning"}
             longest = max(floor["parts"], key=floor["parts"].get)
             share = floor["parts"][longest] / sum(floor["parts"].values())
-            times = row["ours"]["processor"]["median"] / row["threads"] / floor_seconds(row)
-            line += f" Our processor time is {times:.1f} times the floor below; {share:.0%} of the parts' sum is "
+            words = "processor time" if row["device"] == "cpu" else "step"
+            line += f" Our {words} is {spent(row) / floor_seconds(row):.1f} times the floor below; "
+            line += f"{share:.0%} of the parts' sum is "
             line += f"{names.get(longest, longest)}."
         lines.append(line)
     return "\n\n".join(lines)
@@ -97,6 +98,12 @@ def floor_seconds(row: Row) -> float:
     return row["floor"]["flops"] / best_rate(row)
 
 
+def spent(row: Row) -> float:
+    """Seconds of a step that stand beside its floor: of the processor's cores; on a GPU, of the whole step."""
+    ours = row["ours"]
+    return ours["processor"]["median"] / row["threads"] if row["device"] == "cpu" else ours["seconds"]["median"]
+
+
 def best_rate(row: Row) -> float:
     """The highest rate in any row of the same device and threads: of squares, or of the shapes of an update."""
     same = [r for r in rows() if r.get("floor") and (r["device"], r["threads"]) == (row["device"], row["threads"])]
@@ -110,12 +117,16 @@ def floors(found: list[Row]) -> str:
     ]
     for row in (r for r in found if r.get("floor") and not r["work"].startswith("size-")):
         least, rates = floor_seconds(row), row["floor"]["rates"]
-        ours = row["ours"]["processor"]["median"] / row["threads"]
-        cells = [f"{row['floor']['flops'] / 1e9:.3f}", f"{1e3 * least:.2f}", f"{1e3 * ours:.2f}", f"{ours / least:.1f}"]
+        ours, words = spent(row), "" if row["device"] == "cpu" else " (whole step)"
+        cells = [f"{row['floor']['flops'] / 1e9:.3f}", f"{1e3 * least:.2f}", f"{1e3 * ours:.2f}{words}"]
+        cells += [f"{ours / least:.1f}"]
         cells += [f"{rates[name] / 1e9:.0f}" for name in ("square", "forward", "weights", "inputs")]
         lines.append(f"| {row['title'].split(';')[0]} | " + " | ".join(cells) + " |")
-    best = max((best_rate(row) for row in found if row.get("floor")), default=0)
-    return "\n".join([*lines, "", f"The best rate seen: {best / 1e9:.0f} GFLOP/s."])
+    best: dict[str, float] = {}
+    for row in (r for r in found if r.get("floor")):
+        best[row["device"]] = max(best_rate(row), best.get(row["device"], 0))
+    words = " and ".join(f"{v / 1e9:.0f} GFLOP/s{f' ({d})' if len(best) > 1 else ''}" for d, v in best.items())
+    return "\n".join([*lines, "", f"The best rate seen: {words}."])
 
 
 def operations() -> str:
@@ -212,16 +223,22 @@ def memory() -> str:
 
 
 def provenance(found: list[Row]) -> str:
-    """One line: on what the rows were made."""
-    versions = found[0]["versions"]
+    """One line for each device: on what the rows were made."""
+    devices = sorted({row["device"] for row in found})
+    return "\n\n".join(machine([row for row in found if row["device"] == device]) for device in devices)
+
+
+def machine(found: list[Row]) -> str:
+    def words(name: str) -> str:
+        return ", ".join(sorted({str(row["versions"][name]) for row in found}))
+
     commits = sorted({row["versions"]["commit"] or "?" for row in found})
     peers = sorted({f"{n} {v}" for r in found for n, v in r.get("peer", {}).get("packages", {}).items() if n in PEERS})
     dates = sorted({row["date"] for row in found})
-    devices = sorted({row["versions"]["device"] for row in found})
     return (
-        f"{versions['cores']} x86 cores ({', '.join(devices)}), shared with other work: the load is the mean number "
-        f"of processes that wanted a core. Python {versions['python']}, jax {versions['jax']}, "
-        f"MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}; peers: {', '.join(peers)}. "
+        f"{words('cores')} x86 cores ({words('device')}), shared with other work: the load is the mean number "
+        f"of processes that wanted a core. Python {words('python')}, jax {words('jax')}, "
+        f"MuJoCo {words('mujoco')}, Gymnasium {words('gymnasium')}; peers: {', '.join(peers)}. "
         f"Commit {', '.join(commits)}; {' to '.join(dates)}. "
         "Rows: `benchmarks/results/speed.jsonl`."
     )

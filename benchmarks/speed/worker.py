@@ -85,16 +85,18 @@ def sb3(side: dict[str, Any], gate: Gate) -> None:
 
 def sbx(side: dict[str, Any], gate: Gate) -> None:
     """SBX's SAC with its defaults: 256 × 256, batch 256, one update a step."""
+    import jax
     from sbx import SAC
 
     env = register(gate, side["env"])
-    SAC(
-        "MlpPolicy",
-        env,
-        learning_starts=random_steps(side),
-        buffer_size=side.get("capacity", CAPACITY),
-        **side["options"],
-    ).learn(NEVER)
+    with jax.default_device(jax.devices(side["device"])[0]):  # it has no option for that
+        SAC(
+            "MlpPolicy",
+            env,
+            learning_starts=random_steps(side),
+            buffer_size=side.get("capacity", CAPACITY),
+            **side["options"],
+        ).learn(NEVER)
 
 
 def cleanrl(side: dict[str, Any], gate: Gate) -> None:

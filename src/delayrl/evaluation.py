@@ -177,7 +177,8 @@ def _play(policy: Policy, config: dict[str, Any], delay: int | str, episodes: in
     evaluator = Evaluator(policy.agent, policy.spec, config["env"], late, 1, episodes)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
-    returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
+    with jax.default_matmul_precision("float32"):  # a GPU's own is coarser
+        returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
     return {
         "agent": config["agent"],
         "env": config["env"],

@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 
 
 def commit() -> str | None:
@@ -40,7 +40,8 @@ def versions() -> dict[str, Any]:
         except PackageNotFoundError:
             found[package] = None
     found["commit"] = commit()
-    found["device"] = jax.devices()[0].device_kind
+    (device,) = jnp.zeros(()).devices()  # where arrays are made now, which `--device cpu` changes
+    found["device"] = device.device_kind
     found["cores"] = os.cpu_count()
     found["machine"] = f"{platform.system()} {platform.machine()}"
     return found

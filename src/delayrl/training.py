@@ -27,7 +27,7 @@ from tqdm import tqdm
 from delayrl import replay as ring
 from delayrl.acting import Actor
 from delayrl.agents import AGENTS
-from delayrl.agents.base import Agent, Schedule, State, template
+from delayrl.agents.base import PRODUCTS, Agent, Schedule, State, template
 from delayrl.config import check_names, override, values_of
 from delayrl.delays import Delay, as_delay
 from delayrl.envs import delay_of, make, physics
@@ -109,7 +109,11 @@ def train(
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
-    with on_device(device), jax.default_matmul_precision(schedule.precision), ThreadPoolExecutor(threads) as pool:
+    with (
+        on_device(device),
+        jax.default_matmul_precision(PRODUCTS[schedule.precision]),
+        ThreadPoolExecutor(threads) as pool,
+    ):
         official = protocol == "official"
         whole = config.ahead if official and find_agent(agent).drops_last_starts else None
         numbers = [seed + i for i in range(seeds)]
@@ -351,12 +355,12 @@ class Session:
             return {}
         steps = range(self.step - len(self.pending) + 1, self.step + 1)
         due = [self.program.due(step, self.schedule) for step in steps]
-        if any(due) and not self.learning:
-            self.learning = True
-            if int(self.learner.replay.steps.min()) < self.spec.delay + 1:
-                raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
         pending, self.pending = self.pending, []
         self.learner, new = self.program.learn(self.learner, pending, self.keys, steps, due)
+        if any(due) and not self.learning:
+            self.learning = True
+            if int(self.learner.replay.steps.min()) < self.spec.delay + 1:  # the first block's own steps count too
+                raise DelayRLError(f"no episode of {self.env} is long enough to learn from under this protocol")
         return new
 
     def _random(self) -> NDArray[np.float32]:

@@ -15,6 +15,12 @@ from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.views import Sees
 
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
+PRODUCTS: Mapping[Precision, str] = {
+    "float32": "float32",
+    "tensorfloat32": "tensorfloat32",
+    "bfloat16": "BF16_BF16_F32",  # what JAX calls bfloat16 is that on a TPU, and tensorfloat32 on a GPU
+}
+"""JAX's words for a precision, for `jax.default_matmul_precision`."""
 State = Any
 """An agent's state: a tree of arrays; networks, optimisers, temperatures."""
 
