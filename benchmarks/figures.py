@@ -220,7 +220,8 @@ def first(root: Path) -> str:
     bench(["report", str(HERE / "results" / "first.sqlite"), "--out", str(folder)])
     text = (folder / "report.md").read_text()
     made = next(line for line in text.splitlines() if line.startswith("Made on"))
-    return text[text.index("### Normalised return") : text.index("### Anchors")] + made
+    curves = "![Learning curves](docs/results/img/curves-0-0.png)"
+    return text[text.index("### Normalised return") : text.index("### Interquartile")] + f"{curves}\n\n{made}"
 
 
 def main() -> None:
