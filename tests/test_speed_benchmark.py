@@ -279,5 +279,8 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     assert "123 x86 cores (Some GPU)" in other
     assert tables.spent(gpu) == gpu["ours"]["seconds"]["median"]  # its floor is the GPU's, not the processor's
     assert tables.spent(works[0]) == works[0]["ours"]["processor"]["median"] / works[0]["threads"]
+    for table in (tables.resources, tables.parts):
+        assert "(gpu, " not in table(rows)
+        assert f"(gpu, {gpu['threads']} threads) |" in table([*rows, gpu])
     tables.draw_sizes(rows, tmp_path / "sizes.png")
     assert (tmp_path / "sizes.png").stat().st_size > 5000

@@ -62,6 +62,12 @@ def spread(value: dict[str, float]) -> str:
     return f"{value['median']:.2f} ({value['low']:.2f}–{value['high']:.2f})"
 
 
+def where(row: Row, found: list[Row]) -> str:
+    """Device and threads of a row, in a table whose rows differ in them."""
+    several = len({(r["device"], r["threads"]) for r in found}) > 1
+    return f" ({row['device']}, {row['threads']} threads)" if several else ""
+
+
 def resources(found: list[Row]) -> str:
     """Markdown: processor time and memory of both sides."""
     lines = [
@@ -72,7 +78,7 @@ def resources(found: list[Row]) -> str:
         cells = [f"{1e3 * s['processor']['median']:.1f}" for s in sides] + [
             f"{s['peak_bytes'] / 1e6:.0f}" for s in sides
         ]
-        lines.append(f"| {row['title']} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['title']}{where(row, found)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -89,7 +95,7 @@ def parts(found: list[Row]) -> str:
         theirs = row.get("peer", {}).get("parts", {})
         words = {"train_sac": "SAC", "train_belief": "belief", "train_kl": "cloning"}
         cells.append(", ".join(f"{words[n]} {1e3 * theirs[n]['median']:.1f}" for n in words if n in theirs))
-        lines.append(f"| {row['title'].split(';')[0]} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['title'].split(';')[0]}{where(row, found)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -121,7 +127,7 @@ def floors(found: list[Row]) -> str:
         cells = [f"{row['floor']['flops'] / 1e9:.3f}", f"{1e3 * least:.2f}", f"{1e3 * ours:.2f}{words}"]
         cells += [f"{ours / least:.1f}"]
         cells += [f"{rates[name] / 1e9:.0f}" for name in ("square", "forward", "weights", "inputs")]
-        lines.append(f"| {row['title'].split(';')[0]} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['title'].split(';')[0]}{where(row, found)} | " + " | ".join(cells) + " |")
     best: dict[str, float] = {}
     for row in (r for r in found if r.get("floor")):
         best[row["device"]] = max(best_rate(row), best.get(row["device"], 0))
