@@ -272,6 +272,9 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
     assert "ratio 0.50" in tables.behind([slow])
     assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
+    size = next(row for row in rows if row["work"].startswith("size-"))
+    alone = size | {"threads": 1, "ours": size["ours"] | {"steps_per_second": 12345.0}}
+    assert tables.sizes([*rows, alone]) == tables.sizes(rows)
     gpu = json.loads(json.dumps(works[0] | {"device": "gpu"}))
     gpu["versions"] |= {"device": "Some GPU", "cores": 123}
     cpu, other = tables.provenance([*rows, gpu]).split("\n\n")

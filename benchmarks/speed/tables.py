@@ -62,6 +62,11 @@ def spread(value: dict[str, float]) -> str:
     return f"{value['median']:.2f} ({value['low']:.2f}–{value['high']:.2f})"
 
 
+def once(found: list[Row]) -> dict[str, Row]:
+    """One row for each work: the first, that of the most threads (`run.write` sorts them)."""
+    return {row["work"]: row for row in reversed(found)}
+
+
 def where(row: Row, found: list[Row]) -> str:
     """Device and threads of a row, in a table whose rows differ in them."""
     several = len({(r["device"], r["threads"]) for r in found}) > 1
@@ -159,7 +164,7 @@ def sizes(found: list[Row]) -> str:
     lines = [
         *head("preset|task|Δ|seeds|ms/step of a seed|seed-steps/s|processor ms/step|floor, ms|replay|peak MB"),
     ]
-    measured = {row["work"]: row for row in found}
+    measured = once(found)
     for name, work in SIZES.items():
         side, row = work.sides["ours"], measured.get(name)
         cells = [f"`{side['preset']}`", side["env"], side["delay"], side["seeds"]]
@@ -175,7 +180,7 @@ def sizes(found: list[Row]) -> str:
 
 def draw_sizes(found: list[Row], out: Path) -> None:
     """Processor time of a seed's step against Δ, seeds and observation size, and the floor beneath."""
-    chosen = [r for r in found if r["work"].startswith("size-") and r.get("floor")]
+    chosen = [r for r in once(found).values() if r["work"].startswith("size-") and r.get("floor")]
     panels = {
         "delay Δ (steps)": lambda r: r["task"].startswith("HalfCheetah") and r["ours"]["seeds"] == 1 and r["delay"],
         "seeds in lockstep": lambda r: r["task"].startswith("HalfCheetah") and r["delay"] == 5 and r["ours"]["seeds"],
