@@ -271,6 +271,8 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     assert tables.sizes(rows).count("\n") == len(SIZES) + 1
     slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
     assert "ratio 0.50" in tables.behind([slow])
+    slow["peer"]["waiting"] = "passive"
+    assert f"{slow['peer']['steps_per_second']:.1f} (asleep) |" in tables.compared([slow])
     assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
     size = next(row for row in rows if row["work"].startswith("size-"))
     alone = size | {"threads": 1, "ours": size["ours"] | {"steps_per_second": 12345.0}}

@@ -28,7 +28,9 @@ def compared(found: list[Row]) -> str:
     for row in (r for r in found if not r["work"].startswith("size-")):
         cells = [row["title"], row["device"], row["threads"], f"{row['ours']['steps_per_second']:.1f}"]
         if "peer" in row:
-            cells += [f"{row['peer']['steps_per_second']:.1f}", spread(row["ratio"]), spread(row["processor_ratio"])]
+            asleep = " (asleep)" if row["peer"].get("waiting") == "passive" else ""
+            cells += [f"{row['peer']['steps_per_second']:.1f}{asleep}"]
+            cells += [spread(row["ratio"]), spread(row["processor_ratio"])]
         else:
             cells += ["", "", ""]
         cells += [len(row["ours"]["slices"]), f"{row['load']['median']:.1f}"]
