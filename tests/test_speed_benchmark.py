@@ -271,7 +271,12 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     assert tables.sizes(rows).count("\n") == len(SIZES) + 1
     slow = json.loads(json.dumps(works[0])) | {"ratio": {"median": 0.5, "low": 0.4, "high": 0.6}}
     assert "ratio 0.50" in tables.behind([slow])
+    slow["peer"]["waiting"] = "passive"
+    assert f"{slow['peer']['steps_per_second']:.1f} (asleep) |" in tables.compared([slow])
     assert not tables.behind([works[0] | {"ratio": {"median": 2.0, "low": 1, "high": 3}}])
+    size = next(row for row in rows if row["work"].startswith("size-"))
+    alone = size | {"threads": 1, "ours": size["ours"] | {"steps_per_second": 12345.0}}
+    assert tables.sizes([*rows, alone]) == tables.sizes(rows)
     gpu = json.loads(json.dumps(works[0] | {"device": "gpu"}))
     gpu["versions"] |= {"device": "Some GPU", "cores": 123}
     cpu, other = tables.provenance([*rows, gpu]).split("\n\n")
@@ -279,5 +284,8 @@ def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     assert "123 x86 cores (Some GPU)" in other
     assert tables.spent(gpu) == gpu["ours"]["seconds"]["median"]  # its floor is the GPU's, not the processor's
     assert tables.spent(works[0]) == works[0]["ours"]["processor"]["median"] / works[0]["threads"]
+    for table in (tables.resources, tables.parts):
+        assert "(gpu, " not in table(rows)
+        assert f"(gpu, {gpu['threads']} threads) |" in table([*rows, gpu])
     tables.draw_sizes(rows, tmp_path / "sizes.png")
     assert (tmp_path / "sizes.png").stat().st_size > 5000

@@ -28,7 +28,9 @@ def compared(found: list[Row]) -> str:
     for row in (r for r in found if not r["work"].startswith("size-")):
         cells = [row["title"], row["device"], row["threads"], f"{row['ours']['steps_per_second']:.1f}"]
         if "peer" in row:
-            cells += [f"{row['peer']['steps_per_second']:.1f}", spread(row["ratio"]), spread(row["processor_ratio"])]
+            asleep = " (asleep)" if row["peer"].get("waiting") == "passive" else ""
+            cells += [f"{row['peer']['steps_per_second']:.1f}{asleep}"]
+            cells += [spread(row["ratio"]), spread(row["processor_ratio"])]
         else:
             cells += ["", "", ""]
         cells += [len(row["ours"]["slices"]), f"{row['load']['median']:.1f}"]
@@ -62,6 +64,17 @@ def spread(value: dict[str, float]) -> str:
     return f"{value['median']:.2f} ({value['low']:.2f}–{value['high']:.2f})"
 
 
+def once(found: list[Row]) -> dict[str, Row]:
+    """One row for each work: the first, that of the most threads (`run.write` sorts them)."""
+    return {row["work"]: row for row in reversed(found)}
+
+
+def where(row: Row, found: list[Row]) -> str:
+    """Device and threads of a row, in a table whose rows differ in them."""
+    several = len({(r["device"], r["threads"]) for r in found}) > 1
+    return f" ({row['device']}, {row['threads']} threads)" if several else ""
+
+
 def resources(found: list[Row]) -> str:
     """Markdown: processor time and memory of both sides."""
     lines = [
@@ -72,7 +85,7 @@ def resources(found: list[Row]) -> str:
         cells = [f"{1e3 * s['processor']['median']:.1f}" for s in sides] + [
             f"{s['peak_bytes'] / 1e6:.0f}" for s in sides
         ]
-        lines.append(f"| {row['title']} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['title']}{where(row, found)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -89,7 +102,7 @@ def parts(found: list[Row]) -> str:
         theirs = row.get("peer", {}).get("parts", {})
         words = {"train_sac": "SAC", "train_belief": "belief", "train_kl": "cloning"}
         cells.append(", ".join(f"{words[n]} {1e3 * theirs[n]['median']:.1f}" for n in words if n in theirs))
-        lines.append(f"| {row['title'].split(';')[0]} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['title'].split(';')[0]}{where(row, found)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -121,7 +134,7 @@ def floors(found: list[Row]) -> str:
         cells = [f"{row['floor']['flops'] / 1e9:.3f}", f"{1e3 * least:.2f}", f"{1e3 * ours:.2f}{words}"]
         cells += [f"{ours / least:.1f}"]
         cells += [f"{rates[name] / 1e9:.0f}" for name in ("square", "forward", "weights", "inputs")]
-        lines.append(f"| {row['title'].split(';')[0]} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row['title'].split(';')[0]}{where(row, found)} | " + " | ".join(cells) + " |")
     best: dict[str, float] = {}
     for row in (r for r in found if r.get("floor")):
         best[row["device"]] = max(best_rate(row), best.get(row["device"], 0))
@@ -153,7 +166,7 @@ def sizes(found: list[Row]) -> str:
     lines = [
         *head("preset|task|Δ|seeds|ms/step of a seed|seed-steps/s|processor ms/step|floor, ms|replay|peak MB"),
     ]
-    measured = {row["work"]: row for row in found}
+    measured = once(found)
     for name, work in SIZES.items():
         side, row = work.sides["ours"], measured.get(name)
         cells = [f"`{side['preset']}`", side["env"], side["delay"], side["seeds"]]
@@ -169,7 +182,7 @@ def sizes(found: list[Row]) -> str:
 
 def draw_sizes(found: list[Row], out: Path) -> None:
     """Processor time of a seed's step against Δ, seeds and observation size, and the floor beneath."""
-    chosen = [r for r in found if r["work"].startswith("size-") and r.get("floor")]
+    chosen = [r for r in once(found).values() if r["work"].startswith("size-") and r.get("floor")]
     panels = {
         "delay Δ (steps)": lambda r: r["task"].startswith("HalfCheetah") and r["ours"]["seeds"] == 1 and r["delay"],
         "seeds in lockstep": lambda r: r["task"].startswith("HalfCheetah") and r["delay"] == 5 and r["ours"]["seeds"],
