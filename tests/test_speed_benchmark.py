@@ -13,6 +13,7 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "speed")]
 
 import floor  # noqa: E402
+import operations  # noqa: E402
 import run  # noqa: E402
 import worker  # noqa: E402
 from speed import tables  # noqa: E402
@@ -67,6 +68,23 @@ def test_products_of_sac() -> None:
     improve = policy + 2 * value + 2 * value + back(policy, actor) + policy
     counted = floor.matmul_flops(agent.update, state, windows, key, number)
     assert counted == pytest.approx(learn + 0.5 * 2 * improve, rel=0.02)
+
+
+def test_operations_are_what_they_are() -> None:
+    """Of a compiled program: products forward, for weights' gradients, of a batch; random bits; sums and the rest."""
+
+    def program(x: jax.Array, y: jax.Array, w: jax.Array, pairs: jax.Array, key: jax.Array) -> tuple[jax.Array, ...]:
+        bits = jax.lax.optimization_barrier(jax.random.bits(key, x.shape))
+        attention = jnp.einsum("btd,bsd->bts", pairs, pairs)
+        return jnp.tanh(x @ w), jnp.einsum("ri,ro->io", x, y), attention, jnp.cos(x).sum(0), bits
+
+    x, y, w, pairs = jnp.ones((320, 64)), jnp.ones((320, 32)), jnp.ones((64, 48)), jnp.ones((32, 5, 64))
+    text = jax.jit(program).lower(x, y, w, pairs, jax.random.key(0)).compile().as_text()
+    found = list(operations.kinds(text).values())
+    assert found.count("products, forward and for the inputs' gradients") == 1
+    assert found.count("products for the weights' gradients") == 1
+    assert found.count("products of attention") == 1
+    assert {"random bits", "sums", "elementwise"} <= set(found)
 
 
 def test_amortised() -> None:

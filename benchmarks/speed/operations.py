@@ -15,18 +15,14 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-os.environ["OMP_NUM_THREADS"] = "1"
+import jax
+import jax.numpy as jnp
+from floor import Prepared, matmul_flops, prepare, update
 from gate import pin
+from jax.profiler import ProfileData
+from works import WORKS
 
-pin()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-from floor import Prepared, matmul_flops, prepare, update  # noqa: E402
-from jax.profiler import ProfileData  # noqa: E402
-from works import WORKS  # noqa: E402
-
-from delayrl.provenance import versions  # noqa: E402
+from delayrl.provenance import versions
 
 RESULTS = Path(__file__).parent.parent / "results" / "operations.jsonl"
 DEFAULT = ("sac-sbx", "vdpo-64", "vdpo-5")
@@ -37,7 +33,10 @@ BODY = re.compile(r"^%(\S+) \([^\n]*\{\n(.*?)^\}", re.S | re.M)
 
 
 def kinds(program: str) -> dict[str, str]:
-    """Of each operation of a compiled program, by its name: what it is."""
+    """Of each operation of a compiled program, by its name: what it is.
+
+    A product for the weights' gradient whose input XLA transposes first counts as one forward.
+    """
     bodies = dict(BODY.findall(program))
     found = {}
     for name, shape, operation, _, rest in LINE.findall(program):
@@ -101,6 +100,8 @@ def times(prepared: Prepared, index: int) -> dict[str, Any]:
 
 def main() -> int:
     """Profile both phases of the works named, and write their rows."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    pin()
     names = sys.argv[1:] or DEFAULT
     if unknown := [name for name in names if name not in WORKS]:
         print(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}", file=sys.stderr)
