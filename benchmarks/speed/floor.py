@@ -30,7 +30,7 @@ from delayrl.training import on_device
 from delayrl.types import Spec, Transition
 
 ROWS = 2_000
-"""Rows of the replay that the parts are timed on. It fits into the caches, unlike a full one; a batch is little to read."""
+"""Rows of the replay that the parts are timed on. They fit into the caches, unlike a full one; a batch is small."""
 
 
 def matmul_flops(function: Callable[..., Any], *args: Any) -> float:
