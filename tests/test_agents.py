@@ -157,6 +157,7 @@ def test_a_block_of_steps_is_its_steps(name: str) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="JAX 0.10, the newest for Python 3.11, copies the replay")
 @pytest.mark.parametrize("seeds", [1, 2])
 @pytest.mark.parametrize("block", [1, 4])
 def test_learning_copies_no_replay(seeds: int, block: int) -> None:
