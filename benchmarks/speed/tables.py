@@ -272,6 +272,7 @@ def pages(root: Path) -> dict[str, str]:
         "speed-parts": parts(found),
         "speed-floors": floors(found),
         "speed-operations": operations(),
+        "speed-free": f"{compared(rows('speed-free'))}\n\nCommit {rows('speed-free')[0]['versions']['commit']}.",
         "speed-sizes": sizes(found),
         "speed-memory": memory(),
     }
