@@ -227,7 +227,7 @@ class Session:
         )
         if checkpoints[0].complete:
             return
-        replays, pending, hidden, chosen = [], [], [], []
+        replays, pending, chosen = [], [], []
         for i, (run, checkpoint) in enumerate(zip(self.runs, checkpoints, strict=True)):
             loop = checkpoint.arrays("loop")
             columns = {name: np.array(column[i]) for name, column in self.learner.replay._asdict().items()}
@@ -238,16 +238,14 @@ class Session:
             replays.append(ring.Replay(**columns))  # type: ignore[arg-type]
             self.stored[i], self.stored_until[i] = dict(checkpoint.pieces), (int(loop["rows"]), int(loop["steps"]))
             kept = [loop[f"pending.{name}"] for name in Transition._fields if f"pending.{name}" in loop]
-            pending += [Transition(*kept)] if kept else []  # type: ignore[arg-type]
-            hidden += [loop["hidden"]] if kept else []
+            pending += [Stored(Transition(*kept), loop["hidden"])] if kept else []  # type: ignore[arg-type]
             chosen += [loop["chosen"]] if "chosen" in loop else []
             self.actors[i].replay_episode(int(loop["episode"]), loop["actions"])
             if not np.array_equal(self.actors[i].truth, loop["truth"]):
                 raise DelayRLError(f"{self.env} does not repeat an episode from its seed, so the run cannot be resumed")
         self.learner = self.learner._replace(replay=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays))
-        for j in range(len(hidden[0]) if hidden else 0):
-            step = jax.tree.map(lambda *x, j=j: np.stack([y[j] for y in x]), *pending)
-            self.pending.append(Stored(step, np.array([count[j] for count in hidden], np.int32)))
+        for j in range(len(pending[0].hidden) if pending else 0):
+            self.pending.append(jax.tree.map(lambda *x, j=j: np.stack([y[j] for y in x]), *pending))
         self.chosen = np.stack(chosen) if chosen else None
 
     def save(self, *, complete: bool = False) -> None:
@@ -273,10 +271,8 @@ class Session:
             self.stored[i] = {n: d for n, d in self.stored[i].items() if int(n[13:25]) > alive}
             loop: Arrays = {}
             if self.pending:  # where a run was stopped
-                steps_left, hidden = zip(*self.pending, strict=True)
-                left = jax.tree.map(lambda *x, i=i: np.stack([y[i] for y in x]), *steps_left)
-                loop = {f"pending.{name}": x for name, x in left._asdict().items()}
-                loop["hidden"] = np.array([count[i] for count in hidden], np.int32)
+                left = jax.tree.map(lambda *x, i=i: np.stack([y[i] for y in x]), *self.pending)
+                loop = {f"pending.{name}": x for name, x in left.transition._asdict().items()} | {"hidden": left.hidden}
             loop |= {} if self.chosen is None else {"chosen": np.asarray(self.chosen)[i]}
             counts = {"rows": rows, "steps": steps, "lost": lost, "episode": actor.episode}
             loop |= {n: np.asarray(x, np.int32) for n, x in counts.items()}
