@@ -155,9 +155,8 @@ def operations() -> str:
         cells = [row["title"], phase, f"{row['milliseconds']:.1f}", f"{row['gflop']:.2f}"]
         cells += [f"{row['kinds'][k][0]:.2f} ({row['kinds'][k][1]:.0f})" if k in row["kinds"] else "" for k in kinds]
         lines.append("| " + " | ".join(cells) + " |")
-    commits = ", ".join(sorted({row["versions"]["commit"] or "?" for row in found}))
     loads = [row["load"] for row in found]
-    lines += ["", f"Commit {commits}; load before each: {min(loads):.1f} to {max(loads):.1f}."] if found else []
+    lines += ["", f"Commit {commits(found)}; load before each: {min(loads):.1f} to {max(loads):.1f}."] if found else []
     return "\n".join(lines)
 
 
@@ -241,18 +240,21 @@ def provenance(found: list[Row]) -> str:
     return "\n\n".join(machine([row for row in found if row["device"] == device]) for device in devices)
 
 
+def commits(found: list[Row]) -> str:
+    return ", ".join(sorted({row["versions"]["commit"] or "?" for row in found}))
+
+
 def machine(found: list[Row]) -> str:
     def words(name: str) -> str:
         return ", ".join(sorted({str(row["versions"][name]) for row in found}))
 
-    commits = sorted({row["versions"]["commit"] or "?" for row in found})
     peers = sorted({f"{n} {v}" for r in found for n, v in r.get("peer", {}).get("packages", {}).items() if n in PEERS})
     dates = sorted({row["date"] for row in found})
     return (
         f"{words('cores')} x86 cores ({words('device')}), shared with other work: the load is the mean number "
         f"of processes that wanted a core. Python {words('python')}, jax {words('jax')}, "
         f"MuJoCo {words('mujoco')}, Gymnasium {words('gymnasium')}; peers: {', '.join(peers)}. "
-        f"Commit {', '.join(commits)}; {' to '.join(dates)}. "
+        f"Commit {commits(found)}; {' to '.join(dates)}. "
         "Rows: `benchmarks/results/speed.jsonl`."
     )
 
@@ -262,7 +264,7 @@ PEERS = ("torch", "jax", "stable_baselines3", "sbx_rl")
 
 def pages(root: Path) -> dict[str, str]:
     """Text by key for docs/performance.md; the picture is drawn beside it."""
-    found = rows()
+    found, free = rows(), rows("speed-free")
     if not found:
         return {}
     draw_sizes(found, root / "docs" / "img" / "performance-sizes.png")
@@ -272,7 +274,7 @@ def pages(root: Path) -> dict[str, str]:
         "speed-parts": parts(found),
         "speed-floors": floors(found),
         "speed-operations": operations(),
-        "speed-free": f"{compared(rows('speed-free'))}\n\nCommit {rows('speed-free')[0]['versions']['commit']}.",
+        "speed-free": f"{compared(free)}\n\nCommit {commits(free)}.",
         "speed-sizes": sizes(found),
         "speed-memory": memory(),
     }

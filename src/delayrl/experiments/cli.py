@@ -71,6 +71,8 @@ def bench(arguments: list[str]) -> None:
     grid = load_grid(given.grid)
     if given.command != "plan":
         _claim(grid, given, look=True)
+    if given.command == "run":
+        _check_backend(run, given)
     {"plan": _plan, "run": _run, "status": _status, "collect": _collect, "report": _report}[given.command](grid, given)
 
 
@@ -131,7 +133,6 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     cells = _chosen(grid, given.cells)
     _at_least_one("--tries", given.tries)
     _at_least_one("--workers", given.workers)
-    _check_backend(given)
     _claim(grid, given, look=False)
     if given.backend == "slurm":
         _slurm(grid, cells, given)
@@ -193,12 +194,11 @@ def _chosen(grid: Grid, ids: list[str] | None) -> list[Cell]:
     return [cell for cell in grid.cells if cell.id in ids]
 
 
-def _check_backend(given: argparse.Namespace) -> None:
+def _check_backend(run: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     """DelayRLError for an option that the chosen backend does not have: it would be ignored in silence."""
-    nothing: dict[str, Any] = {"sbatch": [], "submit": False, "address": None, "cpus": 1.0, "gpus": 0.0}
     for backend, names in {"slurm": ("sbatch", "submit"), "ray": ("address", "cpus", "gpus")}.items():
         for name in names:
-            if given.backend != backend and getattr(given, name) != nothing[name]:
+            if given.backend != backend and getattr(given, name) != run.get_default(name):
                 raise DelayRLError(f"--{name} needs --backend {backend}; got --backend {given.backend}")
 
 
