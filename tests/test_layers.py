@@ -25,6 +25,7 @@ ORDER = [
     "evaluation deploy.export deploy.latency",
     "deploy",
     "acting learning estimate",
+    "memory",
     "training video",
     "experiments experiments.statistics experiments.folders",
     "experiments.summary",

@@ -1,12 +1,14 @@
-"""How long a run will take, before it starts."""
+"""How long a run will take, and how much memory an update passes through, before it starts."""
 
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from delayrl import replay as ring
-from delayrl.agents.base import Agent, Schedule
+from delayrl.agents.base import Agent, Phase, Schedule, template
 from delayrl.learning import Learner, Program
 from delayrl.types import Spec
 
@@ -26,14 +28,36 @@ def estimate_seconds(
         multiply(square).block_until_ready()
     rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
     seconds = (schedule.steps - step) * 2e-4
-    replay, state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (learner.replay, learner.agent))
     seeds = learner.replay.rows.shape[0]
-    key, number = jax.eval_shape(lambda: jax.random.key(0)), jax.ShapeDtypeStruct((), jnp.int32)
     for phase in program.phases:
-        reach = (phase.batch, spec.delay, agent.ahead(spec))
-        windows = jax.eval_shape(lambda r, k, h, n=reach: ring.sample(r, k, n[0], n[1], n[2], h), replay, key, number)
-        cost = jax.jit(phase.update).lower(state, windows, key, number).cost_analysis()
+        cost = jax.jit(phase.update).lower(*update_shapes(phase, agent, spec)).cost_analysis()
         flops = float((cost or {}).get("flops", 0.0))
         rounds = (schedule.steps - max(step, schedule.random_steps)) / phase.every
         seconds += max(rounds, 0) * phase.updates * seeds * (flops / (UTILISATION * rate) + 3e-4)
     return seconds
+
+
+def product_bytes(agent: Agent, spec: Spec) -> list[int]:
+    """Of each phase: the bytes that the matrix products of one update yield. No device is touched."""
+    shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
+    return [sum(_products(jax.jit(phase.update).trace(*args).jaxpr)) for phase, args in shapes]
+
+
+def update_shapes(phase: Phase, agent: Agent, spec: Spec) -> tuple[Any, ...]:
+    """Shapes and types of what a phase's update is given for one seed. No device is touched."""
+    reach = (phase.batch, spec.delay, agent.ahead(spec))
+    replay = jax.eval_shape(lambda: ring.init(spec, 2))
+    key, number = jax.eval_shape(lambda: jax.random.key(0)), jax.ShapeDtypeStruct((), jnp.int32)
+    windows = jax.eval_shape(lambda replay, key, hidden: ring.sample(replay, key, *reach, hidden), replay, key, number)
+    return template(agent, spec), windows, key, number
+
+
+def _products(jaxpr: Any) -> Iterator[int]:
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield from (x.aval.size * x.aval.dtype.itemsize for x in equation.outvars)
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else [value]:
+                inner = getattr(inner, "jaxpr", inner)  # closed or not
+                if hasattr(inner, "eqns"):
+                    yield from _products(inner)

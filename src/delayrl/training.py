@@ -35,6 +35,7 @@ from delayrl.errors import DelayRLError, StoppedError
 from delayrl.estimate import estimate_seconds
 from delayrl.evaluation import EVALUATION, RANDOM_ACTIONS, Evaluator, check_seed, reset_seed
 from delayrl.learning import Stored, compiled
+from delayrl.memory import keep_memory
 from delayrl.plots import curve
 from delayrl.policy import spec_of
 from delayrl.provenance import versions
@@ -109,15 +110,12 @@ def train(
     runs = [Run(single_home if seeds == 1 else group / f"seed{seed + i}") for i in range(seeds)]
 
     note: Note = (lambda line: tqdm.write(line, file=sys.stderr)) if progress else (lambda line: None)
-    with (
-        on_device(device),
-        jax.default_matmul_precision(PRODUCTS[schedule.precision]),
-        ThreadPoolExecutor(threads) as pool,
-    ):
-        official = protocol == "official"
-        whole = config.ahead if official and find_agent(agent).drops_last_starts else None
-        numbers = [seed + i for i in range(seeds)]
+    official = protocol == "official"
+    whole = config.ahead if official and find_agent(agent).drops_last_starts else None
+    numbers = [seed + i for i in range(seeds)]
+    with ThreadPoolExecutor(threads) as pool:
         session = Session(config, schedule, env, late, numbers, official, whole, pool.map if threads > 1 else map)
+        keep_memory(config, session.spec, seeds)  # before the device is looked for
         description = {
             "agent": agent,
             "preset": preset,
@@ -128,13 +126,17 @@ def train(
             "hyperparameters": values_of(config),
             "schedule": values_of(schedule),
         }
-        session.open(runs, description, overwrite, note)
-        session.run(note, progress, track)
+        with on_device(device), jax.default_matmul_precision(PRODUCTS[schedule.precision]):
+            session.open(runs, description, overwrite, note)
+            session.run(note, progress, track)
     return runs[0] if seeds == 1 else runs
 
 
 class Session:
-    """One call of `train`: the seeds' environments and learners, and where they are written."""
+    """One call of `train`: the seeds' environments and learners, and where they are written.
+
+    No device is touched before `open`.
+    """
 
     def __init__(
         self,
@@ -156,7 +158,6 @@ class Session:
         self.physics = physics(self.actors[0].env)
         self.template = check_fit(agent, schedule, self.actors[0].env)  # before anything is stored
         self.program = compiled(agent, self.spec, whole(self.spec) if whole else 1)
-        self.keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
         self.step, self.learning = 0, False
         self.pending: list[Stored] = []  # the newest steps, which the learners have not been given yet
         self.chosen: Any = None  # the next actions, where they have been chosen already
@@ -168,6 +169,7 @@ class Session:
     def open(self, runs: list[Run], description: dict[str, Any], overwrite: bool, note: Note) -> None:
         """Create the folders, or resume what is there."""
         self.runs, self.description = runs, description
+        self.keys = jax.vmap(jax.random.key)(jnp.asarray(self.seeds))
         ours = [run for run in runs if overwrite and (run.path / "config.json").exists() and run.config]
         for run in ours:
             run.remove()

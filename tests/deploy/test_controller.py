@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 
 import gymnasium as gym
@@ -485,12 +486,15 @@ def test_two_threads() -> None:
     threads = [threading.Thread(target=network, args=(seed,)) for seed in range(3)]
     for thread in threads:
         thread.start()
+    asked: list[tuple[float, list[float], int] | None] = []
+    deadline = time.monotonic() + 60
     try:
-        asked = []
-        for _ in range(400):
+        while len(seen) < 250 and time.monotonic() < deadline:
             before = len(seen)
             given.append(float(controller.act()[0]))
             asked.append(seen[-1] if len(seen) > before else None)
+            if asked[-1] is None:  # everything here is too old: let the network have the processor
+                time.sleep(0.001)
     finally:
         finished.set()
         for thread in threads:
@@ -505,8 +509,8 @@ def test_two_threads() -> None:
             checked += 1
     assert checked > 200
     got = controller.statistics
-    assert got.decisions == 400
-    assert got.new <= 401
+    assert got.decisions == len(given)
+    assert got.new <= len(given) + 1
 
 
 def test_needs_numpy_alone() -> None:
