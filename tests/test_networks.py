@@ -1,5 +1,8 @@
 """The transformer against an independent NumPy implementation, its causality, and densities against SciPy."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +12,7 @@ from scipy import stats
 from scipy.special import erf
 
 from delayrl import networks
+from delayrl.networks import linear
 from delayrl.transformer import dropout, dropout_masks, threefry, transformer, transformer_init
 
 SIZES = {"obs_size": 5, "action_size": 3, "length": 6, "width": 16, "layers": 3}
@@ -147,3 +151,20 @@ def test_transformer_initialisation() -> None:
     assert abs(float(params["join"]["w"].std()) - 0.02) < 1e-3
     assert not params["join"]["b"].any()
     assert abs(float(params["blocks"][0]["qkv"]["w"].max()) - (6 / 256) ** 0.5) < 1e-3
+
+
+@pytest.mark.parametrize("shape", [(6,), (40, 6), (4000, 6), (4001, 6), (1000, 5, 6), (3, 4000, 6)])
+def test_gradients_of_a_layer(shape: tuple[int, ...]) -> None:
+    """Of few rows and of many, alone and for several seeds: those of a plain product."""
+    random = np.random.default_rng(0)
+    x, w, b = (jnp.asarray(random.normal(size=size), jnp.float32) for size in (shape, (6, 3), 3))
+
+    def gradients(layer: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.grad(lambda x, w, b: jnp.sin(layer({"w": w, "b": b}, x)).sum(), (0, 1, 2))
+
+    expected = gradients(lambda params, x: x @ params["w"] + params["b"])(x, w, b)
+    alone = gradients(linear)(x, w, b)
+    seeds = jax.vmap(gradients(linear))(*(jnp.stack([y, 2 * y]) for y in (x, w, b)))
+    for one, other, several in zip(expected, alone, seeds, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-3)
+        np.testing.assert_allclose(one, several[0], rtol=1e-4, atol=2e-3)

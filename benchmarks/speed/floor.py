@@ -25,6 +25,7 @@ from delayrl.agents.base import PRODUCTS, Agent, Phase
 from delayrl.config import override
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
+from delayrl.memory import keep_memory
 from delayrl.policy import spec_of
 from delayrl.training import on_device
 from delayrl.types import Spec, Transition
@@ -156,6 +157,7 @@ def prepare(side: dict[str, Any]) -> Prepared:
     actor = Actor(make(side["env"], delay.observed(), rescale=True), 0, agent.privileged)
     actor.reset()
     spec = spec_of(actor.env)
+    keep_memory(agent, spec, side["seeds"])  # as `train` does; in vain where a device was looked for before
     keys = jax.vmap(jax.random.key)(jnp.arange(side["seeds"]))
     state = jax.jit(jax.vmap(partial(agent.init, spec)))(keys)
     replay = jax.tree.map(lambda x: jnp.stack([x] * side["seeds"]), filled(spec, ROWS))

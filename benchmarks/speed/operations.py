@@ -25,7 +25,7 @@ from works import WORKS
 from delayrl.provenance import versions
 
 RESULTS = Path(__file__).parent.parent / "results" / "operations.jsonl"
-DEFAULT = ("sac-sbx", "vdpo-64", "vdpo-5")
+DEFAULT = ("vdpo-5", "vdpo-64", "sac-sbx")  # the largest first: what it asks of the memory holds for the process
 UPDATES = 30
 
 LINE = re.compile(r"^ +(?:ROOT )?%(\S+) = (\([^=]*?\)|\S+) ([\w-]+)\(([^)]*)\)(.*)$", re.M)

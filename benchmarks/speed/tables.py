@@ -1,14 +1,18 @@
 """Tables and pictures of docs/performance.md, from the rows of run.py alone; figures.py puts them there."""
 
 import json
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
 from speed.works import SIZES
+
+from delayrl.experiments.results import read_table
 
 RESULTS = Path(__file__).parent.parent / "results"
 Row = dict[str, Any]
@@ -160,6 +164,25 @@ def operations() -> str:
     return "\n".join(lines)
 
 
+def blocks() -> str:
+    """Markdown: learning with several steps a call, from the rows of benchmarks/updates-per-call.toml."""
+    found, cells, used = read_table(RESULTS / "updates-per-call.sqlite")
+    lines = head("task|`--updates-per-call`|mean of all evaluations|last evaluation|last, each seed|seed-steps/s")
+    for cell, progress in cells:
+        returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+        for row in (row for row in found if row["cell"] == cell.id and row["policy"] == "agent"):
+            returns[row["step"]][row["seed"]].append(row["return"])
+        means = {step: [float(np.mean(x)) for x in seeds.values()] for step, seeds in sorted(returns.items())}
+        last, speed = means[max(means)], (progress.speed or 0) * len(cell.seeds)
+        cells_of = [f"{cell.env}, Δ = {cell.delay}", str(cell.overrides.get("updates_per_call", 1))]
+        cells_of += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}"]
+        cells_of += [" · ".join(f"{x:.1f}" for x in last), f"{speed:.0f}"]
+        lines.append("| " + " | ".join(cells_of) + " |")
+    commit = ", ".join(sorted({str(versions["commit"]) for versions in used}))
+    about = f"VDPO, preset `small`, three seeds in lockstep. Commit {commit}."
+    return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/updates-per-call.sqlite`."])
+
+
 def sizes(found: list[Row]) -> str:
     """Markdown: cost against Δ, seeds and task; what was not run stays empty."""
     lines = [
@@ -264,7 +287,7 @@ PEERS = ("torch", "jax", "stable_baselines3", "sbx_rl")
 
 def pages(root: Path) -> dict[str, str]:
     """Text by key for docs/performance.md; the picture is drawn beside it."""
-    found, free = rows(), rows("speed-free")
+    found = rows()
     if not found:
         return {}
     draw_sizes(found, root / "docs" / "img" / "performance-sizes.png")
@@ -274,7 +297,7 @@ def pages(root: Path) -> dict[str, str]:
         "speed-parts": parts(found),
         "speed-floors": floors(found),
         "speed-operations": operations(),
-        "speed-free": f"{compared(free)}\n\nCommit {commits(free)}.",
+        "speed-blocks": blocks(),
         "speed-sizes": sizes(found),
         "speed-memory": memory(),
     }

@@ -111,8 +111,9 @@ def transformer(
     masks = iter(dropout_masks(key, rate, shapes) if key is not None and rate > 0 else [None] * len(shapes))
     # join([e_obs, e_action]) as two products: the observation's half is the same for every token
     w_obs, w_action = jnp.split(params["join"]["w"], 2)
-    from_obs = linear(params["obs"], obs) @ w_obs + params["join"]["b"]
-    x = from_obs[..., None, :] + linear(params["action"], actions) @ w_action + params["position"]
+    from_obs = linear(params["obs"], obs) @ w_obs
+    from_actions = linear({"w": w_action, "b": params["join"]["b"]}, linear(params["action"], actions))
+    x = from_obs[..., None, :] + from_actions + params["position"]
     x = dropout(next(masks), rate, layer_norm(params["norm_in"], x))
     causal = jnp.tril(jnp.ones((length, length), bool))
     for block in params["blocks"]:
