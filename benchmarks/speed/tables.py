@@ -166,20 +166,23 @@ def operations() -> str:
 
 def blocks() -> str:
     """Markdown: learning with several steps a call, from the rows of benchmarks/updates-per-call.toml."""
-    found, cells, used = read_table(RESULTS / "updates-per-call.sqlite")
+    if not (table := RESULTS / "updates-per-call.sqlite").exists():
+        return ""
+    found, cells, used = read_table(table)
     lines = head("task|`--updates-per-call`|mean of all evaluations|last evaluation|last, each seed|seed-steps/s")
     for cell, progress in cells:
         returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for row in (row for row in found if row["cell"] == cell.id and row["policy"] == "agent"):
             returns[row["step"]][row["seed"]].append(row["return"])
         means = {step: [float(np.mean(x)) for x in seeds.values()] for step, seeds in sorted(returns.items())}
-        last, speed = means[max(means)], (progress.speed or 0) * len(cell.seeds)
+        last, speed = means[max(means)], progress.speed
         cells_of = [f"{cell.env}, Δ = {cell.delay}", str(cell.overrides.get("updates_per_call", 1))]
         cells_of += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}"]
-        cells_of += [" · ".join(f"{x:.1f}" for x in last), f"{speed:.0f}"]
+        cells_of += [" · ".join(f"{x:.1f}" for x in last)]
+        cells_of += [f"{speed * len(cell.seeds):.0f}" if speed else ""]
         lines.append("| " + " | ".join(cells_of) + " |")
     commit = ", ".join(sorted({str(versions["commit"]) for versions in used}))
-    about = f"VDPO, preset `small`, three seeds in lockstep. Commit {commit}."
+    about = f"VDPO, preset `{cells[0][0].preset}`, {len(cells[0][0].seeds)} seeds in lockstep. Commit {commit}."
     return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/updates-per-call.sqlite`."])
 
 

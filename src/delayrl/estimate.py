@@ -1,7 +1,6 @@
-"""How long a run will take, and how much memory an update passes through, before it starts."""
+"""How long a run will take, before it starts."""
 
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -37,12 +36,6 @@ def estimate_seconds(
     return seconds
 
 
-def product_bytes(agent: Agent, spec: Spec) -> list[int]:
-    """Of each phase: the bytes that the matrix products of one update yield. No device is touched."""
-    shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
-    return [sum(_products(jax.jit(phase.update).trace(*args).jaxpr)) for phase, args in shapes]
-
-
 def update_shapes(phase: Phase, agent: Agent, spec: Spec) -> tuple[Any, ...]:
     """Shapes and types of what a phase's update is given for one seed. No device is touched."""
     reach = (phase.batch, spec.delay, agent.ahead(spec))
@@ -50,14 +43,3 @@ def update_shapes(phase: Phase, agent: Agent, spec: Spec) -> tuple[Any, ...]:
     key, number = jax.eval_shape(lambda: jax.random.key(0)), jax.ShapeDtypeStruct((), jnp.int32)
     windows = jax.eval_shape(lambda replay, key, hidden: ring.sample(replay, key, *reach, hidden), replay, key, number)
     return template(agent, spec), windows, key, number
-
-
-def _products(jaxpr: Any) -> Iterator[int]:
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            yield from (x.aval.size * x.aval.dtype.itemsize for x in equation.outvars)
-        for value in equation.params.values():
-            for inner in value if isinstance(value, tuple | list) else [value]:
-                inner = getattr(inner, "jaxpr", inner)  # closed or not
-                if hasattr(inner, "eqns"):
-                    yield from _products(inner)

@@ -31,10 +31,10 @@ def linear_init(key: Key, inputs: int, outputs: int, std: float | None = None) -
 def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
     """X W + b. As one product of two matrices, whose gradient is faster than that of a product with more axes.
 
-    Of many rows as two products of half of them: one for the weights' gradient would keep two cores badly busy.
+    Of many rows as two products of half of them: in one for the weights' gradient a second core helps XLA little.
     """
     w, rows = params["w"], x.reshape(-1, x.shape[-1]) if x.ndim > 2 else x
-    if x.ndim > 1 and len(rows) >= 4000 and len(rows) % 2 == 0:  # measured
+    if x.ndim > 1 and len(rows) >= 4000 and len(rows) % 2 == 0:  # docs/performance.md
         rows, w = rows.reshape(2, -1, rows.shape[1]), jnp.broadcast_to(w, (2, *w.shape))
     return (rows @ w).reshape(*x.shape[:-1], -1) + params["b"]
 

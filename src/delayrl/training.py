@@ -115,7 +115,8 @@ def train(
     numbers = [seed + i for i in range(seeds)]
     with ThreadPoolExecutor(threads) as pool:
         session = Session(config, schedule, env, late, numbers, official, whole, pool.map if threads > 1 else map)
-        keep_memory(config, session.spec, seeds)  # before the device is looked for
+        if device != "gpu":
+            keep_memory(config, session.spec, seeds)  # before the device is looked for
         description = {
             "agent": agent,
             "preset": preset,
