@@ -186,6 +186,14 @@ def blocks() -> str:
     return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/updates-per-call.sqlite`."])
 
 
+def precision() -> str:
+    """Markdown: the error of coarser products, from the rows of benchmarks/precision.py."""
+    found = rows("precision")
+    lines = head("`--precision`|actions|gradient of the belief's loss")
+    lines += [f"| `{row['precision']}` | {row['action']:.1e} | {row['gradient']:.1e} |" for row in found]
+    return "\n".join([*lines, "", f"Commit {commits(found)}. Rows: `benchmarks/results/precision.jsonl`."])
+
+
 def sizes(found: list[Row]) -> str:
     """Markdown: cost against Δ, seeds and task; what was not run stays empty."""
     lines = [
@@ -301,6 +309,7 @@ def pages(root: Path) -> dict[str, str]:
         "speed-floors": floors(found),
         "speed-operations": operations(),
         "speed-blocks": blocks(),
+        "speed-precision": precision(),
         "speed-sizes": sizes(found),
         "speed-memory": memory(),
     }
