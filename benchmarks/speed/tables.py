@@ -181,7 +181,7 @@ def blocks() -> str:
         cells_of += [" · ".join(f"{x:.1f}" for x in last)]
         cells_of += [f"{speed * len(cell.seeds):.0f}" if speed else ""]
         lines.append("| " + " | ".join(cells_of) + " |")
-    commit = ", ".join(sorted({str(versions["commit"]) for versions in used}))
+    commit = commits([{"versions": versions} for versions in used])
     about = f"VDPO, preset `{cells[0][0].preset}`, {len(cells[0][0].seeds)} seeds in lockstep. Commit {commit}."
     return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/updates-per-call.sqlite`."])
 

@@ -29,12 +29,12 @@ def keep_memory(agent: Agent, spec: Spec, seeds: int) -> bool:
     host's work beside them, and is why small updates stay where they are. Nothing is done without glibc, and off the
     main thread. It holds for the process, and is to be asked for before JAX looks for its devices.
     """
-    if seeds * max(product_bytes(agent, spec), default=0) < LARGE:
-        return False
     if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None or not mallopt(MMAP_THRESHOLD, 2**30):  # an old glibc refuses more than 32 MB
+    if mallopt is None or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
+        return False
+    if not mallopt(MMAP_THRESHOLD, 2**30):  # an old glibc, which knows no more than 32 MB
         return False
     mallopt(TRIM_THRESHOLD, 2**31 - 1)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
