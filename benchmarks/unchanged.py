@@ -1,0 +1,244 @@
+"""Whether a redesign changed a result: record short runs before and after it, and compare bit for bit.
+
+    python benchmarks/unchanged.py record before        # at the old commit
+    python benchmarks/unchanged.py record after         # at the new commit, on the same machine
+    python benchmarks/unchanged.py compare before after
+    python benchmarks/unchanged.py reopen before        # at the new commit: old runs, bundles and tables still open
+
+It uses only the command line and the public names of delayrl, so that it survives a move of every module. Compiled
+arithmetic differs between processors and JAX versions; so both sides are recorded on one machine, and not committed.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load_file
+
+HERE = Path(__file__).parent
+TASK = "InvertedPendulum-v5"
+LENGTH = "--steps 480 --random-steps 120 --evaluate-every 160 --evaluation-episodes 2 --replay-capacity 300".split()
+SAC = "--hidden 16 16 --batch-size 16".split()
+VDPO = "--width 8 --layers 2 --dropout 0.1 --clone-every 40 --clone-updates 5".split()
+DIDA = "--expert-steps 240 --round-steps 40 --imitation-updates 5 --student-hidden 8 8".split()
+RUNS: dict[str, list[str]] = {
+    "vdpo": ["vdpo", "--delay", "3", *SAC, *VDPO],
+    "lifting": ["lifting", "--delay", "3", *SAC, "--lifting-hold", "160", "--lifting-end", "400"],
+    "ad-sac": ["ad-sac", "--delay", "3", *SAC],
+    "dida": ["dida", "--delay", "3", *SAC, *DIDA],
+    "dcac": ["dcac", "--delay", "3", *SAC],
+    "bpql": ["bpql", "--delay", "3", *SAC],
+    "a-sac": ["a-sac", "--delay", "3", *SAC],
+    "sac-memoryless": ["sac-memoryless", "--delay", "3", *SAC],
+    "sac": ["sac", *SAC],
+    "random": ["random", "--delay", "3"],
+    "vdpo-random-delay": ["vdpo", "--delay", "uniform:1:4", *SAC, *VDPO],
+    "dcac-random-delay": ["dcac", "--delay", "paper-stochastic-5", *SAC],
+    "a-sac-channels": ["a-sac", "--delay", "gilbert:0:3:0.3:0.4@fifo+action=1+reward=2", *SAC],
+    "vdpo-official": ["vdpo", "--delay", "3", "--protocol", "official", *SAC, *VDPO],
+    "ad-sac-official": ["ad-sac", "--delay", "3", "--protocol", "official", *SAC],
+    "bpql-lockstep": ["bpql", "--delay", "3", "--seeds", "2", *SAC],
+    "vdpo-blocks": ["vdpo", "--delay", "3", "--updates-per-call", "4", *SAC, *VDPO],
+    "vdpo-stopped": ["vdpo", "--delay", "3", "--seed", "5", *SAC, *VDPO],
+}
+DELAYS = "0 3 uniform:1:4@fifo poisson:2:5@raw gamma:2:1:5 markov:0,4:0.9,0.1/0.5,0.5 walk:3 choice:1=0.5,3=0.5 2+action=1"
+TABLES = ("first.sqlite", "updates-per-call.sqlite")
+GRIDS = ("smoke", "first", "paper-table1", "paper-table2", "paper-ablation", "paper-stochastic")
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name in ("record", "reopen"):
+        commands.add_parser(name).add_argument("folder", type=Path)
+    both = commands.add_parser("compare")
+    both.add_argument("before", type=Path)
+    both.add_argument("after", type=Path)
+    commands.add_parser("stop", help=argparse.SUPPRESS).add_argument("folder", type=Path)
+    given = parser.parse_args()
+    if given.command == "record":
+        record(given.folder)
+    elif given.command == "reopen":
+        reopen(given.folder)
+    elif given.command == "stop":
+        stop(given.folder)
+    else:
+        compare(json.loads((given.before / "facts.json").read_text()), json.loads((given.after / "facts.json").read_text()))
+
+
+def record(folder: Path) -> None:
+    """Train, export, evaluate and report; write what came out to facts.json."""
+    folder.mkdir(parents=True)
+    facts: dict[str, Any] = {}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        runs = {name: pool.submit(train, folder / "runs" / name, name) for name in RUNS}
+        others = {
+            "wrappers": pool.submit(shown),
+            **{f"plan {grid}": pool.submit(delayrl, "bench", "plan", grid, "--runs", str(folder / "none")) for grid in GRIDS},
+            **{table: pool.submit(report, folder, table) for table in TABLES},
+        }
+        for name, run in (runs | others).items():
+            facts[name] = run.result()
+            print(name, "is recorded", flush=True)
+    (folder / "facts.json").write_text(json.dumps(facts, indent=1))
+
+
+def reopen(folder: Path) -> None:
+    """Open what an older version wrote: evaluate its runs, resume the one that was stopped, load its bundles."""
+    before, after = json.loads((folder / "facts.json").read_text()), dict[str, Any]()
+    for name in RUNS:
+        after[name] = before[name] | use(folder / "runs" / name, name)
+    resumed = folder / "resumed"
+    shutil.rmtree(resumed, ignore_errors=True)
+    shutil.copytree(folder / "stopped", resumed)
+    delayrl("train", *RUNS["vdpo-stopped"], *common(resumed))
+    after["vdpo-stopped"] |= result(resumed)
+    after |= {table: report(folder, table) for table in TABLES}
+    compare({name: before[name] for name in after}, after)
+
+
+def compare(before: dict[str, Any], after: dict[str, Any]) -> None:
+    """Say what differs; exit with 1 if anything does."""
+    different = [name for name in before | after if before.get(name) != after.get(name)]
+    for name in different:
+        old, new = before.get(name), after.get(name)
+        parts = [k for k in old if old[k] != new.get(k)] if isinstance(old, dict) and isinstance(new, dict) else ["all"]
+        print(f"{name} differs: {', '.join(parts)}")
+    print(f"{len(before) - len(different)} of {len(before)} are bitwise equal")
+    sys.exit(bool(different))
+
+
+def common(out: Path) -> list[str]:
+    """The options of every run."""
+    return ["--env", TASK, "--preset", "small", "--quiet", "--out", str(out), *LENGTH]
+
+
+def train(out: Path, name: str) -> dict[str, Any]:
+    """Train one of RUNS (the last is stopped on its way and resumed); everything that it wrote, as digests."""
+    if name == "vdpo-stopped":
+        subprocess.run([sys.executable, __file__, "stop", str(out)], check=False, env=quiet())
+        shutil.copytree(out, out.parent.parent / "stopped")
+    delayrl("train", *RUNS[name], *common(out))
+    seeds = sorted(out.glob("seed*")) or [out]
+    facts: dict[str, Any] = {}
+    for number, run in enumerate(seeds):
+        facts |= {f"{key} {number}" if number else key: value for key, value in result(run).items()}
+    return facts | use(out, name)
+
+
+def stop(out: Path) -> None:
+    """Train, and send this process SIGTERM once its first checkpoint is there."""
+    import signal
+    import threading
+    import time
+
+    def watch() -> None:
+        while not (out / "checkpoints" / "000000000160" / "manifest.json").exists():
+            time.sleep(0.001)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+    sys.argv = ["delayrl", "train", *RUNS["vdpo-stopped"], *common(out)]
+    from importlib.metadata import entry_points
+
+    (command,) = entry_points(group="console_scripts", name="delayrl")
+    command.load()()
+
+
+def result(run: Path) -> dict[str, Any]:
+    """Configuration, rows, metrics and weights of a finished run. Weights are compared whatever they are called."""
+    config = json.loads((run / "config.json").read_text())
+    metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()] if (run / "metrics.jsonl").exists() else []
+    (weights,) = run.glob("checkpoints/*/agent.safetensors")
+    arrays = load_file(weights).values()
+    return {
+        "config": {key: value for key, value in config.items() if key != "versions"},
+        "rows": (run / "rows.jsonl").read_text(),
+        "metrics": [{k: v for k, v in line.items() if k != "steps_per_second"} for line in metrics],
+        "weights": sorted(digest(f"{x.dtype}{x.shape}".encode() + x.tobytes()) for x in arrays),
+    }
+
+
+def use(out: Path, name: str) -> dict[str, Any]:
+    """What a run's policy returns, and its bundle."""
+    run = next(iter(sorted(out.glob("seed*"))), out)
+    facts: dict[str, Any] = {"evaluate": delayrl("evaluate", str(run), "--episodes", "2", "--json")}
+    if name == "random":
+        return facts
+    facts["sweep"] = delayrl("evaluate", str(run), "--episodes", "1", "--sweep", "--json")
+    (run / "delays.png").unlink()
+    bundle = out.parent.parent / "bundles" / name
+    if not bundle.exists():
+        delayrl("export", str(run), "--out", str(bundle))
+    from delayrl.deploy import load_bundle
+
+    policy = load_bundle(bundle)
+    obs, actions = np.linspace(-1, 1, 4), np.linspace(-1, 1, policy.max_age).reshape(-1, 1)
+    acted = [policy(obs, actions, age).tolist() for age in range(policy.max_age + 1)]
+    files = {file.name: digest(file.read_bytes()) for file in sorted(bundle.glob("*.safetensors"))}
+    return facts | {"bundle": files, "bundle acts": acted}
+
+
+def shown() -> dict[str, str]:
+    """What the wrappers show of an episode, for many delays."""
+    import gymnasium
+
+    import delayrl as library
+
+    facts = {}
+    for text in DELAYS.split():
+        for name in ("delayrl/Counter-v0", TASK):
+            env = library.AugmentedObservation(library.make(name, text))
+            seen: list[Any] = [env.reset(seed=3)]
+            env.action_space.seed(0)
+            for _ in range(120):
+                seen.append(env.step(env.action_space.sample()))
+                if seen[-1][2] or seen[-1][3]:
+                    seen.append(env.reset())
+            facts[f"{name} {text}"] = digest(repr(seen).encode())
+        vector = library.AugmentedVectorObservation(library.DelayedVector(gymnasium.make_vec("Pendulum-v1", 3), text))
+        seen = [vector.reset(seed=3)]
+        vector.action_space.seed(0)
+        seen += [vector.step(vector.action_space.sample()) for _ in range(220)]
+        facts[f"vector {text}"] = digest(repr(seen).encode())
+    return facts
+
+
+def report(folder: Path, table: str) -> dict[str, str]:
+    """The report of a committed table, file by file."""
+    out = folder / "reports" / table
+    shutil.rmtree(out, ignore_errors=True)
+    delayrl("bench", "report", str(HERE / "results" / table), "--out", str(out))
+    return {str(file.relative_to(out)): digest(file.read_bytes()) for file in sorted(out.rglob("*.*"))}
+
+
+def delayrl(*words: str) -> str:
+    """Run a command of delayrl; what it printed."""
+    done = subprocess.run([sys.executable, "-m", "delayrl", *words], capture_output=True, text=True, env=quiet())
+    if done.returncode:
+        raise SystemExit(f"delayrl {' '.join(words)} failed: {done.stderr.strip()}")
+    return done.stdout
+
+
+def quiet() -> dict[str, str]:
+    """One thread each, and no GPU: the order of additions does not depend on the machine's load."""
+    flags = "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=1"
+    return os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags, "OMP_NUM_THREADS": "1"}
+
+
+def digest(data: bytes) -> str:
+    """A short name for the bytes."""
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+if __name__ == "__main__":
+    main()
