@@ -8,8 +8,8 @@ import argparse
 import json
 from pathlib import Path
 
-from delayrl.evaluation import evaluate, sweep
-from delayrl.runs import Run
+from delayrl.play.evaluation import evaluate, sweep
+from delayrl.run.folder import Run
 
 KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
 

@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot
 from speed import tables as speed
 
-from delayrl.experiments.cli import bench
+from delayrl.cli.bench import bench
 
 HERE = Path(__file__).parent
 COLOURS = {

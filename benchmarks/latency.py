@@ -19,14 +19,14 @@ import jax
 import numpy as np
 from figures import HERE, insert
 
-from delayrl.agents import AGENTS
+from delayrl.agents.registry import AGENTS
+from delayrl.core.types import Spec
 from delayrl.deploy.bundle import BACKENDS
 from delayrl.deploy.export import bundle_files
 from delayrl.deploy.files import write_files
 from delayrl.deploy.latency import latency
-from delayrl.policy import Policy
-from delayrl.provenance import versions
-from delayrl.types import Spec
+from delayrl.play.policy import Policy
+from delayrl.run.provenance import versions
 
 ROWS = HERE / "results" / "latency.jsonl"
 SIZES, DT, DELAYS, NAMES = (17, 6), 0.05, (5, 25, 50), ("vdpo", "bpql")

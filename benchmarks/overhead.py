@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from delayrl.envs import quiet
-from delayrl.provenance import versions
+from delayrl.run.provenance import versions
 from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
 
 TASK = "HalfCheetah-v5"

@@ -18,7 +18,7 @@ from link import Link, Travelling
 from policies import RunPolicy
 
 from delayrl.deploy import Controller, Policy
-from delayrl.provenance import versions
+from delayrl.run.provenance import versions
 
 LINKS = [Link(4, 6), Link(4, 7), Link(3, 8), Link(4, 8), Link(3, 5, loss=0.4), Link(6, 6)]
 EPISODES = 10

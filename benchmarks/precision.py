@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from delayrl import networks, transformer
-from delayrl.agents import AGENTS
+from delayrl.agents.registry import AGENTS
 from delayrl.agents.vdpo import Unseen
-from delayrl.provenance import versions
-from delayrl.types import Spec
+from delayrl.core import networks, transformer
+from delayrl.core.types import Spec
+from delayrl.run.provenance import versions
 
 OUT = Path(__file__).parent / "results" / "precision.jsonl"
 MANTISSA = {"tensorfloat32": 10, "bfloat16": 7}  # bits; float32 has 23

@@ -11,8 +11,8 @@ from typing import Any
 from collect import collect
 
 import delayrl
-from delayrl.agents import AGENTS
-from delayrl.runs import Run
+from delayrl.agents.registry import AGENTS
+from delayrl.run.folder import Run
 
 SMALL_NETWORKS = {"hidden": [64, 64], "batch_size": 64}
 TASKS: dict[str, dict[str, Any]] = {

@@ -25,10 +25,16 @@ from safetensors.numpy import load_file
 
 HERE = Path(__file__).parent
 TASK = "InvertedPendulum-v5"
-LENGTH = "--steps 480 --random-steps 120 --evaluate-every 160 --evaluation-episodes 2 --replay-capacity 300".split()
-SAC = "--hidden 16 16 --batch-size 16".split()
-VDPO = "--width 8 --layers 2 --dropout 0.1 --clone-every 40 --clone-updates 5".split()
-DIDA = "--expert-steps 240 --round-steps 40 --imitation-updates 5 --student-hidden 8 8".split()
+LENGTH = {
+    "--steps": 480,
+    "--random-steps": 120,
+    "--evaluate-every": 160,
+    "--evaluation-episodes": 2,
+    "--replay-capacity": 300,
+}
+SAC = ["--hidden", "16", "16", "--batch-size", "16"]
+VDPO = "--width 8 --layers 2 --dropout 0.1 --clone-every 40 --clone-updates 5".split()  # noqa: SIM905
+DIDA = ["--expert-steps", "240", "--round-steps", "40", "--imitation-updates", "5", "--student-hidden", "8", "8"]
 RUNS: dict[str, list[str]] = {
     "vdpo": ["vdpo", "--delay", "3", *SAC, *VDPO],
     "lifting": ["lifting", "--delay", "3", *SAC, "--lifting-hold", "160", "--lifting-end", "400"],
@@ -49,7 +55,17 @@ RUNS: dict[str, list[str]] = {
     "vdpo-blocks": ["vdpo", "--delay", "3", "--updates-per-call", "4", *SAC, *VDPO],
     "vdpo-stopped": ["vdpo", "--delay", "3", "--seed", "5", *SAC, *VDPO],
 }
-DELAYS = "0 3 uniform:1:4@fifo poisson:2:5@raw gamma:2:1:5 markov:0,4:0.9,0.1/0.5,0.5 walk:3 choice:1=0.5,3=0.5 2+action=1"
+DELAYS = (
+    "0",
+    "3",
+    "uniform:1:4@fifo",
+    "poisson:2:5@raw",
+    "gamma:2:1:5",
+    "markov:0,4:0.9,0.1/0.5,0.5",
+    "walk:3",
+    "choice:1=0.5,3=0.5",
+    "2+action=1",
+)
 TABLES = ("first.sqlite", "updates-per-call.sqlite")
 GRIDS = ("smoke", "first", "paper-table1", "paper-table2", "paper-ablation", "paper-stochastic")
 
@@ -72,7 +88,9 @@ def main() -> None:
     elif given.command == "stop":
         stop(given.folder)
     else:
-        compare(json.loads((given.before / "facts.json").read_text()), json.loads((given.after / "facts.json").read_text()))
+        compare(
+            json.loads((given.before / "facts.json").read_text()), json.loads((given.after / "facts.json").read_text())
+        )
 
 
 def record(folder: Path) -> None:
@@ -81,20 +99,25 @@ def record(folder: Path) -> None:
     facts: dict[str, Any] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         runs = {name: pool.submit(train, folder / "runs" / name, name) for name in RUNS}
-        others = {
-            "wrappers": pool.submit(shown),
-            **{f"plan {grid}": pool.submit(delayrl, "bench", "plan", grid, "--runs", str(folder / "none")) for grid in GRIDS},
-            **{table: pool.submit(report, folder, table) for table in TABLES},
-        }
+        others: dict[str, Any] = {"wrappers": pool.submit(shown)}
+        for grid in GRIDS:
+            others[f"plan {grid}"] = pool.submit(delayrl, "bench", "plan", grid, "--runs", str(folder / "none"))
+        for table in TABLES:
+            others[table] = pool.submit(report, folder, table)
         for name, run in (runs | others).items():
             facts[name] = run.result()
             print(name, "is recorded", flush=True)
     (folder / "facts.json").write_text(json.dumps(facts, indent=1))
 
 
+def facts_of(folder: Path) -> dict[str, Any]:
+    """What `record` wrote."""
+    return dict(json.loads((folder / "facts.json").read_text()))
+
+
 def reopen(folder: Path) -> None:
     """Open what an older version wrote: evaluate its runs, resume the one that was stopped, load its bundles."""
-    before, after = json.loads((folder / "facts.json").read_text()), dict[str, Any]()
+    before, after = facts_of(folder), dict[str, Any]()
     for name in RUNS:
         after[name] = before[name] | use(folder / "runs" / name, name)
     resumed = folder / "resumed"
@@ -119,7 +142,16 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> None:
 
 def common(out: Path) -> list[str]:
     """The options of every run."""
-    return ["--env", TASK, "--preset", "small", "--quiet", "--out", str(out), *LENGTH]
+    return [
+        "--env",
+        TASK,
+        "--preset",
+        "small",
+        "--quiet",
+        "--out",
+        str(out),
+        *(str(word) for pair in LENGTH.items() for word in pair),
+    ]
 
 
 def train(out: Path, name: str) -> dict[str, Any]:
@@ -157,7 +189,11 @@ def stop(out: Path) -> None:
 def result(run: Path) -> dict[str, Any]:
     """Configuration, rows, metrics and weights of a finished run. Weights are compared whatever they are called."""
     config = json.loads((run / "config.json").read_text())
-    metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()] if (run / "metrics.jsonl").exists() else []
+    metrics = (
+        [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        if (run / "metrics.jsonl").exists()
+        else []
+    )
     (weights,) = run.glob("checkpoints/*/agent.safetensors")
     arrays = load_file(weights).values()
     return {
@@ -195,7 +231,7 @@ def shown() -> dict[str, str]:
     import delayrl as library
 
     facts = {}
-    for text in DELAYS.split():
+    for text in DELAYS:
         for name in ("delayrl/Counter-v0", TASK):
             env = library.AugmentedObservation(library.make(name, text))
             seen: list[Any] = [env.reset(seed=3)]

@@ -12,11 +12,11 @@ from jaxtyping import install_import_hook
 
 install_import_hook(
     [
-        "delayrl.networks",
-        "delayrl.transformer",
-        "delayrl.objectives",
-        "delayrl.views",
-        "delayrl.replay",
+        "delayrl.core.networks",
+        "delayrl.core.transformer",
+        "delayrl.core.objectives",
+        "delayrl.core.views",
+        "delayrl.core.replay",
         "delayrl.agents",
     ],
     "beartype.beartype",
@@ -26,7 +26,6 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-from delayrl.acting import Actor  # noqa: E402
 from delayrl.agents.adsac import ADSAC  # noqa: E402
 from delayrl.agents.dcac import DCAC  # noqa: E402
 from delayrl.agents.dida import DIDA  # noqa: E402
@@ -35,6 +34,7 @@ from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.delays import Delay  # noqa: E402
 from delayrl.envs import make  # noqa: E402
+from delayrl.training.actor import Actor  # noqa: E402
 
 TINY_SAC = SAC(hidden=(16, 16), batch_size=16)
 TINY = {

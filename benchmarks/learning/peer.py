@@ -4,8 +4,8 @@ It runs in an environment with that library, without delayrl:
 
     pip install torch==2.13.0 stable-baselines3 sbx-rl 'gymnasium[mujoco]'
 
-Settings are the library's defaults (256 x 256, batch 256, 3e-4, one update a step), with 5,000 random steps. Every 5,000
-steps ten deterministic episodes are played, from the start states that `delayrl train` draws for the same seed and step.
+Settings are the library's defaults (256 x 256, batch 256, 3e-4, one update a step), with 5,000 random steps. Every
+5,000 steps it plays ten deterministic episodes, from the start states that `delayrl train` draws for the same seed.
 """
 
 import argparse
@@ -71,7 +71,10 @@ def main() -> None:
         for episode, (seed, value) in enumerate(zip(seeds, returns, strict=True)):
             lines.append({"step": step, "episode": episode, "reset_seed": seed, "return": value})
         speed = step / (time.perf_counter() - began - playing)
-        print(f"{given.library} {given.env} seed {given.seed}: {step:,} steps, {np.mean(returns):.0f}, {speed:.0f}/s", flush=True)
+        print(
+            f"{given.library} {given.env} seed {given.seed}: {step:,} steps, {np.mean(returns):.0f}, {speed:.0f}/s",
+            flush=True,
+        )
     lines[0]["steps_per_second"] = round(speed, 2)
     draft = out.with_suffix(".draft")
     draft.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -98,7 +101,12 @@ def reset_seed(seed: int, *stream: int) -> int:
 
 def versions(library: str) -> dict[str, Any]:
     """Libraries and hardware."""
-    names = ["gymnasium", "mujoco", "numpy", *({"sb3": ["stable-baselines3", "torch"], "sbx": ["sbx-rl", "jax"]}[library])]
+    names = [
+        "gymnasium",
+        "mujoco",
+        "numpy",
+        *({"sb3": ["stable-baselines3", "torch"], "sbx": ["sbx-rl", "jax"]}[library]),
+    ]
     found: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count()}
     for name in names:
         try:

@@ -18,17 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from gate import pin
 
-from delayrl import replay as ring
-from delayrl.acting import Actor
-from delayrl.agents import AGENTS
 from delayrl.agents.base import PRODUCTS, Agent, Phase
-from delayrl.config import override
+from delayrl.agents.registry import AGENTS
+from delayrl.core import replay as ring
+from delayrl.core.types import Spec, Transition
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
-from delayrl.memory import keep_memory
-from delayrl.policy import spec_of
-from delayrl.training import on_device
-from delayrl.types import Spec, Transition
+from delayrl.play.policy import spec_of
+from delayrl.run.configuration import override
+from delayrl.training.actor import Actor
+from delayrl.training.buffers import keep_memory
+from delayrl.training.train import on_device
 
 ROWS = 2_000
 """Rows of the replay that the parts are timed on. They fit into the caches, unlike a full one; a batch is small."""

@@ -22,7 +22,7 @@ from gate import pin
 from jax.profiler import ProfileData
 from works import WORKS
 
-from delayrl.provenance import versions
+from delayrl.run.provenance import versions
 
 RESULTS = Path(__file__).parent.parent / "results" / "operations.jsonl"
 DEFAULT = ("vdpo-5", "vdpo-64", "sac-sbx")  # the largest first: what it asks of the memory holds for the process

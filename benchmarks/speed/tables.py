@@ -12,7 +12,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot
 from speed.works import SIZES
 
-from delayrl.experiments.results import read_table
+from delayrl.bench.results import read_table
 
 RESULTS = Path(__file__).parent.parent / "results"
 Row = dict[str, Any]

@@ -167,7 +167,7 @@ def hello() -> dict[str, Any]:
             continue
     report: dict[str, Any] = {"packages": found}
     if "delayrl" in sys.modules:
-        from delayrl.provenance import versions
+        from delayrl.run.provenance import versions
 
         report["versions"] = versions()
     return report

@@ -90,7 +90,7 @@ def _start(program: str, *arguments: str) -> subprocess.Popen[str]:
 
 def describe(policy: str) -> Row:
     """What was run, and on what: for the rows."""
-    from delayrl.provenance import versions
+    from delayrl.run.provenance import versions
 
     about: Row = {"agent": policy if policy == "predictor" else "bundle"}
     if (Path(policy) / "checkpoints").is_dir():

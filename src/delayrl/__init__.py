@@ -8,14 +8,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from delayrl.agents import AGENTS as AGENTS
+    from delayrl.agents.registry import AGENTS as AGENTS
     from delayrl.delays import Delay as Delay
     from delayrl.delays import as_delay as as_delay
     from delayrl.envs import make as make
     from delayrl.errors import DelayRLError as DelayRLError
-    from delayrl.policy import Policy as Policy
-    from delayrl.policy import load as load
-    from delayrl.training import train as train
+    from delayrl.play.policy import Policy as Policy
+    from delayrl.play.policy import load as load
+    from delayrl.training.train import train as train
     from delayrl.wrappers import AugmentedObservation as AugmentedObservation
     from delayrl.wrappers import AugmentedVectorObservation as AugmentedVectorObservation
     from delayrl.wrappers import Delayed as Delayed
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "AGENTS": "agents",
+    "AGENTS": "agents.registry",
     "AugmentedObservation": "wrappers",
     "AugmentedVectorObservation": "wrappers",
     "DelayRLError": "errors",
@@ -32,10 +32,10 @@ _HOME = {
     "Delayed": "wrappers",
     "DelayedVector": "wrappers",
     "as_delay": "delays",
-    "Policy": "policy",
-    "load": "policy",
+    "Policy": "play.policy",
+    "load": "play.policy",
     "make": "envs",
-    "train": "training",
+    "train": "training.train",
 }
 __all__ = sorted(_HOME)
 

@@ -1,5 +1,5 @@
 """`python -m delayrl` is the command line."""
 
-from delayrl.cli import main
+from delayrl.cli.main import main
 
 main()

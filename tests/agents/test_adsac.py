@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from conftest import record
-from delayrl import networks
-from delayrl import replay as ring
 from delayrl.agents.adsac import ADSAC, State
 from delayrl.agents.sac import SAC
+from delayrl.core import networks
+from delayrl.core import replay as ring
+from delayrl.core.types import Seen, Spec, Transition, Window
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program, Stored
-from delayrl.types import Seen, Spec, Transition, Window
+from delayrl.training.learner import Program, Stored
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)

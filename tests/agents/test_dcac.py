@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from conftest import record
-from delayrl import networks
-from delayrl import replay as ring
 from delayrl.agents.dcac import DCAC, Roll, values
+from delayrl.core import networks
+from delayrl.core import replay as ring
+from delayrl.core.types import Seen, Spec, Window
+from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program, Stored
-from delayrl.types import Seen, Spec, Window
-from delayrl.views import network_input, view
+from delayrl.training.learner import Program, Stored
 
 AGENT = DCAC(hidden=(16, 16), batch_size=16)
 DELAY = 4

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from conftest import record
-from delayrl import replay as ring
 from delayrl.agents.dida import DIDA
 from delayrl.agents.sac import SAC
+from delayrl.core import replay as ring
+from delayrl.core.networks import mode
+from delayrl.core.types import Seen, Spec, Window
+from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
-from delayrl.learning import Program, Stored
-from delayrl.networks import mode
-from delayrl.types import Seen, Spec, Window
-from delayrl.views import network_input, view
+from delayrl.training.learner import Program, Stored
 
 AGENT = DIDA(
     SAC(hidden=(16, 16), batch_size=16, actor_updates=1),

@@ -10,16 +10,16 @@ import pytest
 from scipy import integrate, stats
 
 from conftest import record
-from delayrl import networks
-from delayrl import replay as ring
 from delayrl.agents import lifting
 from delayrl.agents.lifting import Lifting, lifting_loss, moments
 from delayrl.agents.sac import BPQL
+from delayrl.core import networks
+from delayrl.core import replay as ring
+from delayrl.core.networks import Gaussian
+from delayrl.core.types import Seen, Spec, Transition, Window
+from delayrl.core.views import look
 from delayrl.errors import DelayRLError
-from delayrl.learning import Stored, compiled
-from delayrl.networks import Gaussian
-from delayrl.types import Seen, Spec, Transition, Window
-from delayrl.views import look
+from delayrl.training.learner import Stored, compiled
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)

@@ -8,14 +8,14 @@ import jax
 import numpy as np
 
 from conftest import TINY, TINY_SAC
-from delayrl.agents import AGENTS as REGISTRY
 from delayrl.agents.base import Agent, template
-from delayrl.config import values_of
+from delayrl.agents.registry import AGENTS as REGISTRY
+from delayrl.core.types import Spec
 from delayrl.deploy.export import bundle_files
 from delayrl.deploy.files import write_files
-from delayrl.policy import Policy
-from delayrl.runs import Run, flatten_tree
-from delayrl.types import Spec
+from delayrl.play.policy import Policy
+from delayrl.run.configuration import values_of
+from delayrl.run.folder import Run, flatten_tree
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from bundles import AGENTS, bundle_of, policy_of, random_state
 
-from delayrl.agents import AGENTS as REGISTRY
+from delayrl.agents.registry import AGENTS as REGISTRY
+from delayrl.core.types import Spec
 from delayrl.deploy import load_bundle
+from delayrl.deploy.backends.numpy_policy import _gelu
 from delayrl.deploy.export import network_of
-from delayrl.deploy.numpy_policy import _gelu
 from delayrl.errors import DelayRLError
-from delayrl.policy import Policy
-from delayrl.types import Spec
+from delayrl.play.policy import Policy
 
 SOURCE = Path(__file__).parents[2] / "examples" / "cpp" / "controller.cpp"
 REPEATS = 5

@@ -16,10 +16,10 @@ from bundles import bundle_of, policy_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from delayrl.cli import main
+from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
+from delayrl.deploy.backends.network import parse
 from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, seal
-from delayrl.deploy.network import parse
 from delayrl.errors import DelayRLError
 
 

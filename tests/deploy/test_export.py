@@ -8,12 +8,12 @@ import pytest
 from bundles import bundle_of, policy_of, run_of
 
 from delayrl import load, make
-from delayrl.cli import main
+from delayrl.cli.main import main
 from delayrl.deploy import Controller, export_run, load_bundle
 from delayrl.deploy.latency import ages_of, latency
 from delayrl.envs import tasks
 from delayrl.errors import DelayRLError
-from delayrl.runs import Checkpoint, Run
+from delayrl.run.folder import Checkpoint, Run
 
 
 @pytest.fixture(scope="module")

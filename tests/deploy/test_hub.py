@@ -16,7 +16,7 @@ import huggingface_hub
 import pytest
 from bundles import bundle_of, policy_of
 
-from delayrl.cli import main
+from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
 from delayrl.deploy.files import LIMITS, WEIGHTS
 from delayrl.deploy.hub import card, pull, push

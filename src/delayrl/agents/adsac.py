@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from delayrl import networks
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase
+from delayrl.core import networks
+from delayrl.core.networks import Params
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
-from delayrl.networks import Params
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import network_input, view
 
 Behaviour = Literal["lower-q", "augmented"]
 

@@ -10,9 +10,9 @@ import jax
 import optax
 from jaxtyping import Array, Int
 
-from delayrl.networks import Params
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import Sees
+from delayrl.core.networks import Params
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import Sees
 
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 PRODUCTS: Mapping[Precision, str] = {

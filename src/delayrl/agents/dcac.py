@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from delayrl import networks
 from delayrl.agents.base import Agent, Deterministic, Phase, descend
+from delayrl.core import networks
+from delayrl.core.networks import Gaussian, Params
+from delayrl.core.objectives import k_step_return, soft_target
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import input_size, network_input, view
 from delayrl.errors import DelayRLError
-from delayrl.networks import Gaussian, Params
-from delayrl.objectives import k_step_return, soft_target
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import input_size, network_input, view
 
 
 class State(NamedTuple):

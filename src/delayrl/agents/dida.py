@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from delayrl import networks
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase, Schedule, descend
+from delayrl.core import networks
+from delayrl.core.networks import Params
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import input_size, look, network_input
 from delayrl.errors import DelayRLError
-from delayrl.networks import Params
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import input_size, look, network_input
 
 
 class State(NamedTuple):

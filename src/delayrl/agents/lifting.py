@@ -22,10 +22,10 @@ from jaxtyping import Array, Float, Int
 
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase, Schedule
+from delayrl.core.networks import Gaussian
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import look
 from delayrl.errors import DelayRLError
-from delayrl.networks import Gaussian
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import look
 
 NODES, SPAN = 64, 4.5
 """Standard normal noise at evenly spaced nodes in ±SPAN: for the wide Gaussians, whose tanh is nearly a step, far more

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from delayrl.agents.base import Agent, Deterministic, Phase
+from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.errors import DelayRLError
-from delayrl.types import Action, Key, Seen, Spec
 
 
 class State(NamedTuple):

@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from delayrl import networks
 from delayrl.agents.base import Agent, Deterministic, Phase, descend
+from delayrl.core import networks
+from delayrl.core.networks import Gaussian, LogStdBounds, Params
+from delayrl.core.objectives import k_step_return, soft_target, soft_value, temperature_loss
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import Sees, input_size, look, network_input
 from delayrl.errors import DelayRLError
-from delayrl.networks import Gaussian, LogStdBounds, Params
-from delayrl.objectives import k_step_return, soft_target, soft_value, temperature_loss
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import Sees, input_size, look, network_input
 
 
 class State(NamedTuple):

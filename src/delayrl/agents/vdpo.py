@@ -19,15 +19,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from delayrl import networks
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase, descend
+from delayrl.core import networks
+from delayrl.core.networks import Gaussian, Params
+from delayrl.core.objectives import gaussian_kl, masked_mean
+from delayrl.core.transformer import transformer, transformer_init
+from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
+from delayrl.core.views import view
 from delayrl.errors import DelayRLError
-from delayrl.networks import Gaussian, Params
-from delayrl.objectives import gaussian_kl, masked_mean
-from delayrl.transformer import transformer, transformer_init
-from delayrl.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.views import view
 
 Representation = Literal["transformer", "transformer-no-belief", "mlp"]
 Behaviour = Literal["lower-q", "delayed", "reference", "mixture"]

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from delayrl.deploy.bundle import Bundle as Bundle
     from delayrl.deploy.bundle import load_bundle as load_bundle
-    from delayrl.deploy.controller import ClockError as ClockError
-    from delayrl.deploy.controller import Controller as Controller
-    from delayrl.deploy.controller import OverrunError as OverrunError
-    from delayrl.deploy.controller import Policy as Policy
     from delayrl.deploy.export import export_run as export_run
-    from delayrl.deploy.statistics import Statistics as Statistics
+    from delayrl.deploy.runtime.controller import ClockError as ClockError
+    from delayrl.deploy.runtime.controller import Controller as Controller
+    from delayrl.deploy.runtime.controller import OverrunError as OverrunError
+    from delayrl.deploy.runtime.controller import Policy as Policy
+    from delayrl.deploy.runtime.statistics import Statistics as Statistics
 
 _HOME = {
     "Bundle": "bundle",
-    "ClockError": "controller",
-    "Controller": "controller",
-    "OverrunError": "controller",
-    "Policy": "controller",
-    "Statistics": "statistics",
+    "ClockError": "runtime.controller",
+    "Controller": "runtime.controller",
+    "OverrunError": "runtime.controller",
+    "Policy": "runtime.controller",
+    "Statistics": "runtime.statistics",
     "export_run": "export",
     "load_bundle": "bundle",
 }

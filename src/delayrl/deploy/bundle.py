@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delayrl.deploy.controller import LONGEST, SHORTEST
+from delayrl.deploy.backends.network import Act, Network
+from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
-from delayrl.deploy.network import Act, Network
-from delayrl.deploy.numpy_policy import numpy_policy
+from delayrl.deploy.runtime.controller import LONGEST, SHORTEST
 from delayrl.errors import DelayRLError
 
 BACKENDS = ("numpy", "onnx", "jax")
@@ -98,10 +98,10 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
     if backend == "numpy":
         return Bundle(network, metadata, reference, backend)
     if backend == "jax":
-        from delayrl.deploy.jax_policy import jax_policy
+        from delayrl.deploy.backends.jax_policy import jax_policy
 
         return Bundle(network, metadata, jax_policy(network, arrays), backend)
-    from delayrl.deploy.onnx_policy import onnx_policy
+    from delayrl.deploy.backends.onnx_policy import onnx_policy
 
     if GRAPH not in files:
         raise DelayRLError(f"{path} holds no {GRAPH}")

@@ -7,14 +7,14 @@ import numpy as np
 import safetensors.numpy
 from gymnasium.spaces import Box
 
+from delayrl.deploy.backends.network import Arrays, Network
+from delayrl.deploy.backends.onnx_graph import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
-from delayrl.deploy.network import Arrays, Network
-from delayrl.deploy.onnx_graph import onnx_graph
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
-from delayrl.policy import Policy, restored
-from delayrl.provenance import versions
-from delayrl.runs import Run, flatten_tree
+from delayrl.play.policy import Policy, restored
+from delayrl.run.folder import Run, flatten_tree
+from delayrl.run.provenance import versions
 from delayrl.wrappers.single import seconds_of
 
 

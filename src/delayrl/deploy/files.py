@@ -23,7 +23,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import NDArray
 
-from delayrl.deploy.network import Arrays, Network, parse
+from delayrl.deploy.backends.network import Arrays, Network, parse
 from delayrl.errors import DelayRLError
 
 FORMAT = 1

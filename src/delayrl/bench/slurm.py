@@ -1,0 +1,109 @@
+"""Slurm: a grid as an array job.
+
+Each element runs one cell with the local runner. When its time is up, or Slurm asks it to stop, it stores a checkpoint
+and puts itself into the queue again. Slurm does that for an element whose node failed.
+"""
+
+import math
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from delayrl.bench import folders
+from delayrl.bench.grid import Cell, Grid
+from delayrl.bench.runner import GRACE, STOPPED
+from delayrl.errors import DelayRLError
+
+HOUR = 3600.0
+
+SCRIPT = """#!/bin/bash
+#SBATCH --job-name=delayrl-{name}
+#SBATCH --array=0-{last}
+#SBATCH --time={minutes}
+#SBATCH --signal=B:TERM@{before}
+#SBATCH --requeue
+#SBATCH --open-mode=append
+#SBATCH --output="{log}"
+{extra}
+# Written by `delayrl bench run {name} --backend slurm`.
+cells=({ids})
+{command} --cells "${{cells[$SLURM_ARRAY_TASK_ID]}}" &
+runner=$!
+trap 'kill -TERM $runner' TERM
+wait $runner
+status=$?
+while kill -0 $runner 2>/dev/null; do # the signal ended `wait`, not the runner
+    wait $runner
+    status=$?
+done
+if [ $status -eq {stopped} ]; then
+    scontrol requeue "$SLURM_JOB_ID"
+fi
+exit $status
+"""
+
+
+def script(
+    grid: Grid,
+    cells: Sequence[Cell],
+    runs: Path,
+    *,
+    time_limit: float | None = None,
+    options: Sequence[str] = (),
+    arguments: Sequence[str] = (),
+) -> str:
+    """The text of an sbatch script for the cells.
+
+    Args:
+        grid: where they come from.
+        cells: those to run, one element of the array each.
+        runs: the folder of the cells' folders, on a file system that the nodes share.
+        time_limit: seconds that an element may take before it stops and queues again (default: an hour).
+        options: words for `#SBATCH` lines, e.g. "--partition=gpu".
+        arguments: more words for `delayrl bench run`.
+    """
+    source = grid.name if grid.is_shipped else str(grid.source.resolve())
+    words = [sys.executable, "-m", "delayrl", "bench", "run", source, "--runs", str(runs.resolve()), *arguments]
+    limit = HOUR if time_limit is None else time_limit
+    words += ["--time-limit", f"{int(limit)}s"]
+    before = int(GRACE) + 30
+    for option in options:
+        if not option.startswith("-") or "\n" in option:
+            raise DelayRLError(f"--sbatch takes an option of sbatch, e.g. --sbatch=--partition=gpu; got {option!r}")
+    return SCRIPT.format(
+        name=grid.name,
+        last=len(cells) - 1,
+        minutes=math.ceil((limit + before) / 60),
+        before=before,
+        log=runs.resolve() / "slurm" / f"{grid.name}-%a.log",
+        extra="\n".join(f"#SBATCH {option}" for option in options),
+        ids=" ".join(cell.id for cell in cells),
+        command=shlex.join(words),
+        stopped=STOPPED,
+    )
+
+
+def write(grid: Grid, cells: Sequence[Cell], runs: Path, text: str) -> Path:
+    """Prepare the cells' folders and write the script below `runs`."""
+    for cell in cells:
+        folders.prepare(runs / cell.folder, cell)
+    file = runs / "slurm" / f"{grid.name}.sbatch"
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    except OSError as error:
+        raise DelayRLError(f"cannot write {file}: {error.strerror}") from error
+    return file
+
+
+def submit(file: Path) -> str:
+    """Hand a script to Slurm; returns the job's number."""
+    if shutil.which("sbatch") is None:
+        raise DelayRLError(f"there is no sbatch here; on a machine that has it: sbatch {file}")
+    done = subprocess.run(["sbatch", "--parsable", str(file)], capture_output=True, text=True)
+    if done.returncode:
+        raise DelayRLError(f"sbatch refuses {file}: {(done.stderr.strip() or 'no reason given').splitlines()[0]}")
+    return done.stdout.strip().split(";")[0]

@@ -1,0 +1,1 @@
+"""What flows through training, and pure functions on it: types, replay, views, networks, objectives."""

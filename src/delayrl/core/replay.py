@@ -1,0 +1,119 @@
+"""Replay: one ring of the true trajectory on the device, whatever the delay.
+
+A row is an observation and what was done in it; an episode of T steps takes T + 1 rows, the last for its final
+observation. So each observation is stored once (Humanoid, a million rows: 1.6 GB), and every augmented state, belief
+target and k-step return is gathered by index when it is sampled. Functions are for one seed; `jax.vmap` adds the axis.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from delayrl.core.types import Key, Spec, Transition, Window
+
+
+class Replay(NamedTuple):
+    """The ring. Row r of the trajectory, counted from the first ever, lies at index r mod capacity."""
+
+    obs: Float[Array, "capacity obs"]
+    action: Float[Array, "capacity action"]
+    reward: Float[Array, " capacity"]
+    age: Int[Array, " capacity"]
+    terminated: Bool[Array, " capacity"]
+    moment: Int[Array, " capacity"]  # steps since the start of the row's episode
+    row_of: Int[Array, " capacity"]  # step j of the run (mod capacity) -> its row
+    rows: Int[Array, ""]  # the row of the current observation: rows completed so far
+    steps: Int[Array, ""]  # steps stored so far
+    lost: Int[Array, ""]  # of them, steps that the ring has overwritten
+
+
+def init(spec: Spec, capacity: int) -> Replay:
+    """An empty ring of `capacity` rows: 4 (S + A) + 17 bytes a row."""
+    count = jnp.zeros((), jnp.int32)
+    return Replay(
+        obs=jnp.zeros((capacity, spec.obs_size)),
+        action=jnp.zeros((capacity, spec.action_size)),
+        reward=jnp.zeros(capacity),
+        age=jnp.zeros(capacity, jnp.int32),
+        terminated=jnp.zeros(capacity, jnp.bool_),
+        moment=jnp.zeros(capacity, jnp.int32),
+        row_of=jnp.zeros(capacity, jnp.int32),
+        rows=count,
+        steps=count,
+        lost=count,
+    )
+
+
+def append(replay: Replay, step: Transition, whole: int = 1) -> Replay:
+    """Store one step: its row, and its outcome in the next row, which the episode's next step will complete.
+
+    A step can be drawn once `whole` steps of its episode are there, itself included: with 1 every one, with more the
+    last whole - 1 of an episode never (as released code whose n-step window is cleared at its end).
+    """
+    capacity = replay.obs.shape[0]
+    here, after = replay.rows % capacity, (replay.rows + 1) % capacity
+    rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps its last observation's row
+    moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before it is written, or all is copied
+    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (whole - 1))
+    steps, lost = replay.steps + (moment >= whole), replay.lost
+    for _ in range(2):  # at most two rows are overwritten
+        lost += ((lost < steps) & (row_of[lost % capacity] <= rows - capacity)).astype(jnp.int32)
+    return Replay(
+        obs=replay.obs.at[here].set(step.obs).at[after].set(step.next_obs),
+        action=replay.action.at[here].set(step.action),
+        reward=replay.reward.at[here].set(step.reward),
+        age=replay.age.at[here].set(step.age).at[after].set(step.next_age),
+        terminated=replay.terminated.at[here].set(step.terminated),
+        moment=replay.moment.at[after].set(moment).at[rows % capacity].set(jnp.where(step.done, 0, moment)),
+        row_of=row_of,
+        rows=rows,
+        steps=steps,
+        lost=lost,
+    )
+
+
+def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden: Int[Array, ""]) -> Window:
+    """Draw windows around uniformly drawn steps; they never cross the border of an episode.
+
+    Args:
+        replay: a ring with at least one step whose outcome has arrived.
+        key: random key.
+        batch: how many windows.
+        delay: Δ, the rows before the step.
+        ahead: the rows after it; the longest k of a k-step target.
+        hidden: how many of the newest observations have not arrived yet: the learner's age, 0 if it may see all.
+
+    Returns:
+        Windows with a leading axis `batch`.
+    """
+    capacity = replay.obs.shape[0]
+    pick, length = jax.random.split(key)
+    # in a full ring the Δ rows before the oldest steps may be overwritten: those steps are not drawn
+    first = jnp.where(replay.lost > 0, replay.lost + delay, 0)
+    last = replay.steps - hidden
+    step = jax.random.randint(pick, (batch, 1), jnp.minimum(first, last - 1), last)
+    row = replay.row_of[step % capacity]
+    # between two episodes the current row is still empty
+    newest = replay.rows - (replay.moment[replay.rows % capacity] == 0).astype(jnp.int32) - hidden
+
+    offset = jnp.arange(-delay, ahead + 1)
+    index = (row + offset) % capacity
+    moment = replay.moment[row % capacity] + offset
+    # in a row of another episode the count of moments does not go on
+    valid = (moment >= 0) & (replay.moment[index] == moment) & (row + offset <= newest)
+    lead = (valid & (offset > 0)).sum(1)
+    acted = valid & (offset < lead[:, None])  # the last row has no action yet, or never
+    drawn = jax.random.randint(length, (batch,), 1, max(ahead, 1) + 1)
+    return Window(
+        obs=jnp.where(valid[..., None], replay.obs[index], 0),
+        age=jnp.where(valid, replay.age[index], 0),
+        action=jnp.where(acted[..., None], replay.action[index], 0),
+        reward=jnp.where(acted, replay.reward[index], 0),
+        terminated=acted & replay.terminated[index],
+        valid=valid,
+        lead=lead,
+        steps=jnp.minimum(drawn, lead),
+        delay=delay,
+    )

@@ -1,0 +1,1 @@
+"""One network, computed by NumPy, ONNX Runtime or JAX."""

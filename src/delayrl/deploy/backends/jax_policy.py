@@ -1,0 +1,59 @@
+"""A bundle's policy with the networks that trained it: for comparison, and where JAX is at hand anyway."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from delayrl.core import networks
+from delayrl.core.transformer import transformer
+from delayrl.deploy.backends.network import Act, Arrays, Network
+
+
+def jax_policy(network: Network, arrays: Arrays) -> Act:
+    """A function of (obs [S], actions [Δ, A], age), as `Bundle` has it; compiled by its first call."""
+    params = _tree(arrays)
+    low, high = jnp.asarray(network.low), jnp.asarray(network.high)
+
+    @jax.jit
+    def act(params: Any, obs: Any, actions: Any, age: Any) -> Any:
+        scaled = 2 * (actions - low) / (high - low) - 1
+        scaled = jnp.where((jnp.arange(network.max_age) < age)[:, None], scaled, 0)
+        x = obs
+        if network.input == "augmented":
+            x = jnp.concatenate([obs, scaled.reshape(-1), (age / network.max_age)[None]])
+        if network.input == "transformer":
+            x = transformer(params["encoder"], obs, scaled)[age - 1]
+        raw = networks.mlp(params["head"], x)
+        if network.current is not None:
+            raw = jnp.where(age > 0, raw, networks.mlp(params["current"], obs))
+        return low + (jnp.tanh(raw) + 1) / 2 * (high - low)
+
+    params = jax.device_put(params)
+
+    def on_host(obs: NDArray[np.float32], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
+        return np.asarray(act(params, obs, actions, np.int32(age)))
+
+    return on_host
+
+
+def _tree(arrays: Arrays) -> Any:
+    """Names with dots as nested dictionaries, and as lists where the names are numbers."""
+    root: dict[str, Any] = {}
+    for name, array in arrays.items():
+        *path, leaf = name.split(".")
+        node = root
+        for part in path:
+            node = node.setdefault(part, {})
+        node[leaf] = array
+
+    def lists(node: Any) -> Any:
+        if not isinstance(node, dict):
+            return node
+        if all(key.isdigit() for key in node):
+            return [lists(node[str(i)]) for i in range(len(node))]
+        return {key: lists(value) for key, value in node.items()}
+
+    return lists(root)

@@ -1,0 +1,63 @@
+"""A bundle's policy.onnx, run by onnxruntime on one thread."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delayrl.deploy.backends.network import Act, Network
+from delayrl.errors import DelayRLError
+
+LOCATION = b"location"
+"""The key by which a graph names another file for its numbers. Older versions of onnxruntime would read any file."""
+
+
+def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
+    """A function of (obs [S], actions [Δ, A], age), as `Bundle` has it.
+
+    A graph from elsewhere is run in no other way than on arrays: it must take and give what ours do, and agree with
+    `reference`, the policy in the weights, on a few inputs.
+    """
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise DelayRLError("the backend onnx takes the package onnxruntime: pip install 'delayrl[deploy]'") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    if LOCATION in model:
+        raise DelayRLError("it refers to another file")
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own exceptions have no common name
+        raise DelayRLError(f"onnxruntime cannot load it ({_line(error)})") from error
+    found = [(x.name, x.type, x.shape) for x in (*session.get_inputs(), *session.get_outputs())]
+    expected: list[Any] = [
+        ("obs", "tensor(float)", [network.obs_size]),
+        ("actions", "tensor(float)", [network.max_age, network.action_size]),
+        ("age", "tensor(int64)", []),
+        ("action", "tensor(float)", [network.action_size]),
+    ]
+    if found != expected:
+        raise DelayRLError("its inputs and outputs are not obs, actions, age and action in the policy's sizes")
+
+    def act(obs: NDArray[np.float32], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
+        return session.run(["action"], {"obs": obs, "actions": actions, "age": np.asarray(age, np.int64)})[0]
+
+    random = np.random.default_rng(0)
+    low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
+    for age in sorted({0, 1, network.max_age // 2, network.max_age} & set(range(network.max_age + 1))):
+        obs = random.standard_normal(network.obs_size).astype(np.float32)
+        actions = random.uniform(low, high, (network.max_age, network.action_size)).astype(np.float32)
+        try:
+            same = np.abs(act(obs, actions, age) - reference(obs, actions, age)) <= 1e-3 * (high - low)
+        except Exception as error:
+            raise DelayRLError(f"it does not run ({_line(error)})") from error
+        if not same.all():
+            raise DelayRLError("it gives other actions than the weights beside it")
+    return act
+
+
+def _line(error: Exception) -> str:
+    return repr((str(error).strip().splitlines() or [type(error).__name__])[0][:120])  # which may quote the graph

@@ -1,0 +1,1 @@
+"""What keeps the history of actions right around a policy."""

@@ -1,0 +1,1 @@
+"""Trained policies at play: acting, evaluation, pictures and videos."""

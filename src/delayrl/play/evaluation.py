@@ -1,0 +1,190 @@
+"""Evaluation: deterministic actions, a start state of its own for every episode, one row per episode, never a mean."""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpy.typing import NDArray
+
+from delayrl.agents.base import Agent, State
+from delayrl.core.types import Action, Key, Seen, Spec
+from delayrl.core.views import seen_now
+from delayrl.delays import Delay
+from delayrl.envs import delay_of, make
+from delayrl.errors import DelayRLError
+from delayrl.play.policy import Policy, load
+from delayrl.run.folder import Run
+
+
+class Episodes(NamedTuple):
+    """Undiscounted returns and lengths, [seeds, episodes]."""
+
+    returns: NDArray[np.float64]
+    lengths: NDArray[np.int64]
+
+
+class Evaluator:
+    """Plays episodes of all seeds beside each other, one call of the policy for each step of all of them.
+
+    Args:
+        agent: whose policy is played.
+        spec: the task as the agent was trained on it.
+        env: id of the task.
+        delay: under which it is played; its maximum must not be longer than `spec.delay`. A text or number for `make`.
+        seeds: length of the seed axis of the states.
+        episodes: how many for each.
+        apply: `map`, or that of a pool of threads, which steps the environments beside each other.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        spec: Spec,
+        env: str,
+        delay: int | str | Delay,
+        seeds: int,
+        episodes: int,
+        apply: Callable[..., Iterator[Any]] = map,
+    ) -> None:
+        late = servable(env, delay, spec)
+        self._delay, self._apply = spec.delay, apply
+        self._envs = [[make(env, late, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        self._act = _compiled_act(agent)
+
+    def __call__(
+        self,
+        states: State,
+        reset_seeds: Sequence[Sequence[int]],
+        keys: Key,
+        first: NDArray[np.float32] | None = None,
+        travel: Sequence[Sequence[int]] | None = None,
+    ) -> Episodes:
+        """Play one episode from each reset seed, [seeds, episodes].
+
+        With `first` for the first actions, [.., .., A], and travel times from the seeds `travel`, if these are given.
+        """
+        shape = (len(self._envs), len(self._envs[0]))
+        returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
+        seen = [
+            [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
+            for envs, seeds in zip(self._envs, reset_seeds, strict=True)
+        ]
+        for envs, seeds in zip(self._envs, travel or (), strict=False):
+            for env, seed in zip(envs, seeds, strict=True):
+                env.draw_from(seed)
+        step = 0
+        while running.any():
+            batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
+            actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
+            actions = first if step == 0 and first is not None else actions
+            step += 1
+            alive = [(int(i), int(j)) for i, j in np.argwhere(running)]
+            played = self._apply(self._step, alive, [actions[at] for at in alive])
+            for (i, j), (obs, reward, terminated, truncated, info) in zip(alive, played, strict=True):
+                if not (np.isfinite(reward) and np.isfinite(info["truth"]).all()):
+                    raise DelayRLError(
+                        "the environment gave a reward or an observation that is not finite in evaluation"
+                    )
+                returns[i, j] += float(reward)
+                lengths[i, j] += 1
+                running[i, j] = not (terminated or truncated)
+                seen[i][j] = self._see(obs, info)
+        return Episodes(returns, lengths)
+
+    def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
+        return self._envs[at[0]][at[1]].step(action)
+
+    def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
+        return seen_now(obs, info, self._delay, privileged=False)
+
+
+def servable(env: str, delay: int | str | Delay, spec: Spec) -> Delay:
+    """The delay without that of rewards; DelayRLError where its ages are longer than a policy was trained for."""
+    late = delay_of(env, delay).acted()
+    if late.maximum > spec.delay:
+        raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {late.maximum}")
+    return late
+
+
+@functools.cache
+def _compiled_act(agent: Agent) -> Any:
+    """Deterministic actions for [seeds, episodes], each with a key of its own."""
+
+    def one(state: State, seen: Seen, key: Key, step: Array, episode: Array) -> Action:
+        for number in (step, episode):
+            key = jax.random.fold_in(key, number)
+        return agent.act(state, seen, key, explore=False)
+
+    def episodes(state: State, seen: Seen, key: Key, step: Array) -> Action:
+        numbers = jnp.arange(seen.age.shape[0])
+        return jax.vmap(one, (None, 0, None, None, 0))(state, seen, key, step, numbers)
+
+    return jax.jit(jax.vmap(episodes, (0, 0, 0, None)))
+
+
+def check_seed(seed: int) -> None:
+    """Seeds are whole numbers from 0 to 2³¹ - 1."""
+    if not 0 <= seed < 2**31:
+        raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed}")
+
+
+def reset_seed(seed: int, *stream: int) -> int:
+    """A seed for one episode: the same numbers give the same seed, others an unrelated one."""
+    return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0] >> 1)
+
+
+TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
+"""Streams of `reset_seed`: start states of evaluation are none of training's, those of `evaluate` none of either."""
+
+
+def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None, seed: int = 0) -> dict[str, Any]:
+    """Play the policy of a run folder on start states that it never saw.
+
+    Args:
+        run: the run folder.
+        episodes: how many.
+        delay: any delay that it can serve, a number or a text; None for the one it was trained for.
+        seed: of the start states.
+
+    Returns:
+        agent, env, delay, episodes, mean_return, std_return, returns.
+
+    Raises:
+        DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
+    """
+    policy, config = load(run), Run(Path(run)).config
+    return _play(policy, config, config["delay"] if delay is None else delay, episodes, seed)
+
+
+def sweep(run: str | Path, episodes: int = 10, seed: int = 0) -> Iterator[dict[str, Any]]:
+    """`evaluate` at every constant delay from 0 to the longest age that the policy was trained for."""
+    policy, config = load(run), Run(Path(run)).config
+    for delay in range(policy.spec.delay + 1):
+        yield _play(policy, config, delay, episodes, seed)
+
+
+def _play(policy: Policy, config: dict[str, Any], delay: int | str, episodes: int, seed: int) -> dict[str, Any]:
+    if episodes < 1:
+        raise DelayRLError(f"episodes must be at least 1; got {episodes}")
+    check_seed(seed)
+    late = delay_of(config["env"], delay)
+    evaluator = Evaluator(policy.agent, policy.spec, config["env"], late, 1, episodes)
+    states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
+    seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
+    with jax.default_matmul_precision("float32"):  # a GPU's own is coarser
+        returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
+    return {
+        "agent": config["agent"],
+        "env": config["env"],
+        "delay": late.label(),
+        "episodes": episodes,
+        "mean_return": float(returns.mean()),
+        "std_return": float(returns.std()),
+        "returns": returns.tolist(),
+    }

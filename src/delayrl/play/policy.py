@@ -1,0 +1,94 @@
+"""A trained policy, for use: `load` a run, then `act` on what the wrapper shows."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from delayrl.agents.base import Agent, State, template
+from delayrl.agents.registry import AGENTS
+from delayrl.core.types import Spec
+from delayrl.core.views import seen_now
+from delayrl.envs import make
+from delayrl.errors import DelayRLError
+from delayrl.run.configuration import check_names, override
+from delayrl.run.folder import Checkpoint, Run, restore_tree
+
+
+class Policy:
+    """A policy with its weights.
+
+    Attributes:
+        agent: its hyperparameters.
+        state: its weights, a tree of arrays.
+        spec: sizes of the task, and the longest age it was trained for.
+        low, high: the range of its actions, [A].
+    """
+
+    def __init__(self, agent: Agent, state: State, spec: Spec, low: NDArray[Any], high: NDArray[Any], seed: int = 0):
+        self.agent, self.state, self.spec = agent, state, spec
+        self.low, self.high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+        self._key = jax.random.key(seed)
+        self._act = jax.jit(lambda state, seen, key: agent.act(state, seen, key, explore=False))
+
+    def act(self, obs: NDArray[Any], info: dict[str, Any]) -> NDArray[np.float32]:
+        """The deterministic action, in the task's own units.
+
+        Args:
+            obs: the newest observation that has arrived, [S].
+            info: `age`, and `actions` [≥ age, A] taken since, oldest first, in the task's own units: what
+                `Delayed` puts there.
+
+        Raises:
+            DelayRLError: wrong sizes, or an age that the policy was not trained for.
+        """
+        obs, actions, age = np.asarray(obs), np.asarray(info["actions"]), int(info["age"])
+        if obs.shape != (self.spec.obs_size,):
+            raise DelayRLError(f"the policy takes observations of size {self.spec.obs_size}; got shape {obs.shape}")
+        if not 0 <= age <= self.spec.delay:
+            raise DelayRLError(f"the policy was trained for ages 0..{self.spec.delay}; got {age}")
+        if len(actions) < age:
+            raise DelayRLError(f"an observation of age {age} needs the {age} actions taken since; got {len(actions)}")
+        scaled = 2 * (actions - self.low) / (self.high - self.low) - 1
+        seen = seen_now(obs, {"age": age, "actions": scaled}, self.spec.delay, privileged=False)
+        self._key, key = jax.random.split(self._key)
+        action = np.asarray(self._act(self.state, seen, key))
+        return self.low + (action + 1) / 2 * (self.high - self.low)
+
+
+def load(path: str | Path) -> Policy:
+    """The policy of a run folder, from its newest good checkpoint.
+
+    Raises:
+        DelayRLError: no run folder, no good checkpoint, or one of another agent.
+    """
+    run = Run(Path(path))
+    config = run.config
+    return restored(config, run.latest())
+
+
+def restored(config: dict[str, Any], checkpoint: Checkpoint) -> Policy:
+    """The policy in a checkpoint of a run with this configuration."""
+    agent = agent_of(config)
+    env = make(config["env"], config["delay"])
+    spec = spec_of(env)
+    state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
+    env.close()
+    return Policy(agent, state, spec, env.action_space.low, env.action_space.high)  # type: ignore[attr-defined]
+
+
+def agent_of(config: dict[str, Any]) -> Agent:
+    """The agent that a run's configuration describes."""
+    try:
+        agent = AGENTS[config["agent"]].presets[config["preset"]].agent
+        check_names(config["hyperparameters"], agent)
+        return override(agent, config["hyperparameters"])  # type: ignore[no-any-return]
+    except KeyError as error:
+        raise DelayRLError(f"the run's configuration names an unknown agent or preset: {error}") from error
+
+
+def spec_of(env: Any) -> Spec:
+    """Sizes and longest age of a wrapped task."""
+    return Spec(env.observation_space.shape[0], env.action_space.shape[0], env.history)

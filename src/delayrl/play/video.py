@@ -1,0 +1,66 @@
+"""A rendered episode as a file, without a screen."""
+
+import os
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from delayrl.errors import DelayRLError
+
+
+def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -> tuple[int, float]:
+    """Play one episode of a run's policy and write it to an .mp4 or .gif file.
+
+    Returns:
+        The number of frames, and the return.
+
+    Raises:
+        DelayRLError: another kind of file, no run, or no way to render.
+    """
+    if out.suffix not in (".mp4", ".gif"):
+        raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")
+    from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed
+
+    check_seed(seed)
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
+    import imageio
+
+    from delayrl.envs import make
+    from delayrl.play.evaluation import servable
+    from delayrl.play.policy import load
+    from delayrl.run.folder import Run
+
+    config = Run(run).config
+    policy = load(run)
+    late = servable(config["env"], config["delay"] if delay is None else delay, policy.spec)
+    env = make(config["env"], late, render_mode="rgb_array")
+    obs, info = env.reset(seed=reset_seed(seed, HELD_OUT, 0))
+    frames, total, done = [], 0.0, False
+    try:
+        while not done:
+            frames.append(np.asarray(env.render()))
+            obs, reward, terminated, truncated, info = env.step(policy.act(obs, info))
+            total += float(reward)
+            done = terminated or truncated
+    except Exception as error:
+        if isinstance(error, DelayRLError):
+            raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DelayRLError(
+            f"{config['env']} cannot be rendered here ({reason}); on Linux without a screen EGL is needed (libegl1)"
+        ) from error
+    rate = float(env.metadata.get("render_fps") or 30)
+    try:
+        if out.suffix == ".gif":  # viewers do not go faster than 50 frames a second
+            stride = max(1, round(rate / 25))
+            imageio.mimsave(out, frames[::stride], duration=1000 * stride / rate, loop=0)
+        else:
+            with warnings.catch_warnings():  # on the fork that starts the encoder, beside JAX's idle threads
+                warnings.simplefilter("ignore", RuntimeWarning)
+                imageio.mimsave(out, frames, fps=rate, macro_block_size=None)
+    except OSError as error:
+        raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
+    return len(frames), total

@@ -1,0 +1,1 @@
+"""From rows to results: conditions, statistics, tables, figures, one page."""

@@ -1,0 +1,196 @@
+"""Pictures of a summary, as PNG files."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from delayrl.report.statistics import mean_std
+from delayrl.report.summary import THRESHOLDS, Aggregate, Delay, Result, Setting, Summary, agent_order, delay_order
+
+STYLES = {
+    "vdpo": ("#2b63b5", "#7aaeff", ""),
+    "ad-sac": ("#d64550", "#ff8e96", ""),
+    "bpql": ("#1f8a3b", "#55c777", ""),
+    "dida": ("#a3307a", "#e888c4", "8 3"),
+    "dcac": ("#9a8400", "#d8c64c", "2 2"),
+    "a-sac": ("#1d93b8", "#62cdf0", "6 2 2 2"),
+    "lifting": ("#c65d00", "#ffa25c", "10 3"),
+    "sac-memoryless": ("#777777", "#a0a0a0", "4 3"),
+    "sac": ("#333333", "#dddddd", "6 3"),
+    "random": ("#999999", "#777777", "1 3"),
+}
+"""Colours on light and on dark ground, and dashes: told apart with any colour vision, and in black and white."""
+SPARE = tuple(
+    zip(("#5b4bb7", "#00796b", "#8d5524", "#546e7a"), ("#a99cff", "#4fc3b4", "#d39b6a", "#9fb6c1"), strict=True)
+)
+Look = tuple[str, str, str, str]  # name, then a style
+SAC: Look = ("delay-free SAC", *STYLES["sac"])
+RANDOM: Look = ("random", *STYLES["random"])
+DASHES = ("5 2", "2 3", "9 2 2 2", "")
+
+
+def styles(labels: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """A style for each label: its agent's own; variants of an agent, and agents of yours, get what is left."""
+    left = [(*colour, dash) for dash in DASHES for colour in SPARE]
+    chosen: dict[str, tuple[str, str, str]] = {}
+    for label in labels:
+        chosen[label] = STYLES[label] if label in STYLES else left[(len(set(chosen) - set(STYLES))) % len(left)]
+    return chosen
+
+
+def draw(summary: Summary, out: Path) -> dict[tuple[Setting, str], list[str]]:
+    """Draw everything that there are numbers for. Gives file names by setting and kind: curves, delay, aggregates."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    out.mkdir(parents=True, exist_ok=True)
+    looks = {label: (summary.name(label), *style) for label, style in styles(list(summary.labels)).items()}
+    made: dict[tuple[Setting, str], list[str]] = {}
+    for number, setting in enumerate(summary.settings):
+        results = [r for r in summary.results.values() if r.place.setting == setting and r.runs]
+        learners = [r for r in results if not r.is_anchor]
+        delays = sorted({r.place.delay for r in learners}, key=delay_order)
+        names = []
+        for index, delay in enumerate(delays):
+            name = f"curves-{number}-{index}.png"
+            _curves([r for r in learners if r.place.delay == delay], delay, looks, out / name)
+            names.append(name)
+        made[setting, "curves"] = names
+        constant = [r for r in learners if isinstance(r.place.delay, int)]
+        made[setting, "delay"] = []
+        if len({r.place.delay for r in constant}) > 1:
+            _against_delay(constant, looks, out / f"delay-{number}.png")
+            made[setting, "delay"] = [f"delay-{number}.png"]
+        aggregates = [a for a in summary.aggregates if a.setting == setting]
+        made[setting, "aggregates"] = []
+        if aggregates:
+            _aggregates(aggregates, looks, out / f"aggregates-{number}.png")
+            made[setting, "aggregates"] = [f"aggregates-{number}.png"]
+    return made
+
+
+def _grid(count: int, width: float = 4.0, height: float = 2.9) -> tuple[Any, list[Any]]:
+    from matplotlib import pyplot
+
+    columns = min(3, count)
+    lines = math.ceil(count / columns)
+    figure, axes = pyplot.subplots(
+        lines, columns, figsize=(max(6.0, width * columns), height * lines + 0.5), layout="constrained", squeeze=False
+    )
+    panels = list(axes.flat)
+    for panel in panels:
+        panel.grid(alpha=0.2)
+        panel.spines[["top", "right"]].set_visible(False)
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    return figure, panels
+
+
+def _save(figure: Any, panels: list[Any], path: Path) -> None:
+    from matplotlib import pyplot
+
+    found = {
+        label: line
+        for p in panels
+        for line, label in zip(*p.get_legend_handles_labels(), strict=True)
+        if not label.startswith("_")
+    }
+    names = sorted(found, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
+    figure.legend(
+        [found[name] for name in names], names, loc="outside lower center", ncols=5, frameon=False, fontsize=9
+    )
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _line(look: Look) -> dict[str, Any]:
+    name, colour, _, dashes = look
+    dash = tuple(float(x) / 1.5 for x in dashes.split())
+    return {"label": _plain(name), "color": colour, "linestyle": (0, dash) if dash else "-", "linewidth": 1.8}
+
+
+def _plain(text: str) -> str:
+    """A name from the rows: short, no formula, nothing that cannot be drawn."""
+    return text[:60].encode("utf-8", "replace").decode().replace("$", r"\$")
+
+
+def _anchor_lines(axes: Any, result: Result) -> None:
+    for anchor, look in ((result.reference_anchor, SAC), (result.random_anchor, RANDOM)):
+        if not math.isnan(anchor.value):
+            axes.axhline(anchor.value, **_line(look) | {"linewidth": 1.1})
+
+
+def _curves(results: list[Result], delay: Delay, looks: dict[str, Look], path: Path) -> None:
+    """Mean over the seeds and standard deviation, a panel for each task."""
+    tasks = sorted({r.place.env for r in results})
+    figure, panels = _grid(len(tasks))
+    for task, axes in zip(tasks, panels, strict=False):
+        mine = [r for r in results if r.place.env == task]
+        for result in mine:
+            curve = result.curves
+            axes.plot(curve.steps, curve.mean, **_line(looks[result.place.label]))
+            if result.runs > 1:
+                std = curve.returns.std(0, ddof=1)
+                colour = looks[result.place.label][1]
+                axes.fill_between(curve.steps, curve.mean - std, curve.mean + std, color=colour, alpha=0.13, lw=0)
+        _anchor_lines(axes, mine[0])
+        axes.set_title(f"{_plain(task)}, Δ = {_plain(str(delay))}", fontsize=10)
+        axes.set(xlabel="environment steps", ylabel="return")
+        axes.ticklabel_format(axis="both", style="sci", scilimits=(-3, 4))
+    _save(figure, panels, path)
+
+
+def _against_delay(results: list[Result], looks: dict[str, Look], path: Path) -> None:
+    """Return after training against the delay, a panel for each task; bars are standard deviations over the seeds."""
+    tasks = sorted({r.place.env for r in results})
+    figure, panels = _grid(len(tasks))
+    for task, axes in zip(tasks, panels, strict=False):
+        mine = [r for r in results if r.place.env == task and not r.partial]
+        for label in dict.fromkeys(r.place.label for r in mine):
+            points = [r for r in mine if r.place.label == label]
+            values = np.array([mean_std(r.curves.final) for r in points])
+            delays = [r.place.delay for r in points]
+            axes.errorbar(
+                delays,
+                values[:, 0],
+                np.nan_to_num(values[:, 1]),
+                marker="o",
+                markersize=4,
+                capsize=2,
+                **_line(looks[label]),
+            )
+        if mine:
+            _anchor_lines(axes, mine[0])
+        axes.set_title(_plain(task), fontsize=10)
+        axes.set(xlabel="delay (steps)", ylabel="return")
+    _save(figure, panels, path)
+
+
+def _aggregates(aggregates: list[Aggregate], looks: dict[str, Look], path: Path) -> None:
+    """IQM with its interval, and the performance profile beside it, a line for each delay."""
+    from matplotlib import pyplot
+
+    delays = list(dict.fromkeys(a.delay for a in aggregates))
+    figure, axes = pyplot.subplots(
+        len(delays), 2, figsize=(9, 2.8 * len(delays) + 0.5), layout="constrained", squeeze=False
+    )
+    for (left, right), delay in zip(axes, delays, strict=True):
+        mine = [a for a in aggregates if a.delay == delay]
+        title = "all constant delays" if delay is None else f"Δ = {_plain(str(delay))}"
+        for height, a in enumerate(reversed(mine)):
+            style = _line(looks[a.label])
+            left.plot([a.low, a.high], [height, height], color=style["color"], linewidth=6, alpha=0.3)
+            left.plot(a.iqm, height, "o", color=style["color"])
+            right.plot(THRESHOLDS, a.profile, **style)
+            right.fill_between(THRESHOLDS, a.profile_low, a.profile_high, color=style["color"], alpha=0.12, lw=0)
+        left.set_yticks(range(len(mine)), [_plain(looks[a.label][0]) for a in reversed(mine)])
+        left.set(title=f"IQM, {title}", xlabel="normalised return", ylim=(-0.6, len(mine) - 0.4))
+        right.set(title=f"Performance profile, {title}", xlabel="normalised return τ", ylabel="runs above τ")
+        for panel in (left, right):
+            panel.grid(alpha=0.2)
+            panel.spines[["top", "right"]].set_visible(False)
+            panel.title.set_fontsize(10)
+    _save(figure, list(axes.flat), path)

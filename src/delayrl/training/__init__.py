@@ -1,0 +1,1 @@
+"""Training: the loop, its learner and actors, and how it stops and resumes."""

@@ -1,0 +1,210 @@
+"""Every agent under random delays: it learns from what its actor saw, and from nothing that had not arrived."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import delayrl
+from conftest import TINY, record
+from delayrl.cli.main import main as cli
+from delayrl.core import replay as ring
+from delayrl.core.types import Spec, Transition
+from delayrl.core.views import view
+from delayrl.delays import Channel, Constant, Delay, as_delay
+from delayrl.play.evaluation import evaluate
+from delayrl.training.actor import Actor
+from delayrl.training.learner import Program, Stored
+from delayrl.training.train import Session
+from short_runs import arrays, train
+from strategies import CHANNELS
+
+DELAYED = [name for name in TINY if name != "sac"]
+STOCHASTIC = "uniform:1:3@raw"
+
+
+@settings(max_examples=15, deadline=None)
+@given(CHANNELS, st.integers(0, 2), st.integers(0, 99))
+def test_round_trip(channel: Channel, lag: int, seed: int) -> None:
+    """What the wrapper showed is what `view` makes of the replay, now and k steps later, for every law and rule."""
+    delay = Delay(channel, Channel(Constant(lag))).observed()
+    longest = delay.maximum
+    transitions, shown = record("delayrl/Counter-v0", delay, 90, seed)
+    replay = ring.init(Spec(2, 1, longest), 200)
+    append = jax.jit(ring.append)
+    for transition in transitions:
+        replay = append(replay, transition)
+    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(
+        replay, jax.random.key(seed), 256, longest, 2, jnp.int32(0)
+    )
+    now, later = (jax.vmap(lambda w, k=k: view(w, k))(windows) for k in (0, 1))
+    by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
+    for i, action in enumerate(np.asarray(windows.action[:, longest, 0]).tolist()):
+        step = by_action[action]
+        known = [(now, step)]
+        if step + 1 < len(shown) and not transitions[step].done:
+            known.append((later, step + 1))
+        for seen, number in known:
+            assert int(seen.age[i]) == shown[number].age
+            np.testing.assert_array_equal(seen.obs[i], shown[number].obs)
+            np.testing.assert_array_equal(seen.actions[i], shown[number].actions)
+
+
+@pytest.mark.parametrize("name", DELAYED)
+def test_every_agent_learns_under_random_delays(name: str) -> None:
+    """Some updates of each agent on raw, unordered ages: all finite, and the parameters move."""
+    agent, longest = TINY[name], as_delay(STOCHASTIC).maximum
+    transitions, shown = record("Reacher-v5", STOCHASTIC, 120)
+    assert {int(s.age) for s in shown} == {0, 1, 2, 3}
+    program = Program(agent, Spec(10, 2, longest))
+    keys = jax.vmap(jax.random.key)(jnp.arange(1))
+    learner = program.init(keys, 200)
+    before = jax.device_get(learner.agent)
+    for step, transition in enumerate(transitions, 1):
+        due = tuple(i for i, p in enumerate(program.phases) if step > 105 and step % p.every == 0)
+        batched = Transition(*(np.asarray(x)[None] for x in transition))
+        learner, metrics = program.learn(
+            learner, [Stored(batched, np.zeros(1, np.int32))], keys, range(step, step + 1), [due]
+        )
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(metrics))
+    after = jax.device_get(learner.agent)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(after) if np.issubdtype(x.dtype, np.floating))
+    assert not all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("delay", "longest"),
+    [("3", 3), ("uniform:0:3", 3), ("uniform:1:2+action=1", 3), ("1+reward=4", 4), ("1+action=3+reward=4", 7)],
+)
+def test_what_may_be_missing_is_hidden(delay: str, longest: int) -> None:
+    """An overtaken observation may arrive late, and an action acts before its reward sets out."""
+    late = as_delay(delay)
+    for name in ("bpql", "vdpo"):
+        schedule = delayrl.AGENTS[name].presets["small"].schedule
+        session = Session(TINY[name], schedule, "Reacher-v5", late, [0])
+        actor = session.actors[0]
+        actor.reset()
+        for t in range(60):
+            expected = 0 if TINY[name].privileged else min(t % 50, longest)
+            assert session._hidden().tolist() == [expected]
+            actor.step(np.zeros(2, np.float32))
+
+
+def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Travel times come back with the episode: the same rows and parameters as uninterrupted."""
+    delay = "uniform:0:2@fifo+action=1+reward=2"
+    whole = train("a-sac", tmp_path / "whole", delay=delay)
+    assert whole.config["delay"] == delay
+    assert {row["delay"] for row in whole.read("rows")} == {delay}
+
+    class KilledError(Exception):
+        pass
+
+    learn = Session._learn
+
+    def fail(self: Session):
+        if self.step == 237:
+            raise KilledError
+        return learn(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "_learn", fail)
+        with pytest.raises(KilledError):
+            train("a-sac", tmp_path / "cut", delay=delay)
+    cut = train("a-sac", tmp_path / "cut", delay=delay)
+    assert cut.read("rows") == whole.read("rows")
+    for name, array in arrays(cut).items():
+        np.testing.assert_array_equal(array, arrays(whole)[name])
+
+
+def test_rows_name_the_physics(tmp_path: Path) -> None:
+    run = train("random", tmp_path / "pusher", env="delayrl/Pusher-v4", delay="paper-stochastic-5")
+    row = run.read("rows")[0]
+    assert row["delay"] == run.config["delay"] == "paper-stochastic-5"
+    assert row["mujoco"] == run.config["versions"]["mujoco"]
+    assert row["gymnasium"] == run.config["versions"]["gymnasium"]
+    assert len(row["physics"]) == 16
+    other = train("random", tmp_path / "probe", env="delayrl/Counter-v0", delay=1).read("rows")[0]
+    assert other["physics"] is other["mujoco"] is None
+
+
+def test_a_recorded_delay_needs_its_file_only_once(tmp_path: Path) -> None:
+    trace = tmp_path / "trace.csv"
+    trace.write_text("delay\n" + "\n".join(["2", "0", "3"] * 20))
+    run = train("a-sac", tmp_path / "run", delay=f"recorded:{trace}")
+    trace.unlink()
+    assert delayrl.load(run.path).spec.delay == 3
+    assert np.isfinite(evaluate(run.path, 2)["mean_return"])
+    assert len(run.read("rows")[0]["delay"]) < 40
+
+
+def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = train("vdpo", tmp_path / "run", delay="uniform:1:3")
+    returns = {d: evaluate(run.path, 2, d)["mean_return"] for d in (None, 0, "2@fifo", "2+action=1", "uniform:0:3@raw")}
+    assert len(set(returns.values())) == 5
+    with pytest.raises(delayrl.DelayRLError, match="up to 3"):
+        evaluate(run.path, 2, "3+action=1")
+    cli.main(["evaluate", str(run.path), "--sweep", "--episodes", "2", "--json"])
+    results = json.loads(capsys.readouterr().out)
+    assert [r["delay"] for r in results] == [0, 1, 2, 3]
+    assert results[0]["mean_return"] == returns[0]
+    assert (run.path / "delays.png").stat().st_size > 5000
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", str(run.path), "--sweep", "--delay", "2"])
+
+
+def test_official_episodes_have_their_own_travel_times() -> None:
+    """One start state, as in the released code; but not one sequence of delays."""
+    actor = Actor(delayrl.make("delayrl/Counter-v0", "uniform:0:4", rescale=True), 0, False, official=True)
+    actor.reset()
+    ages: list[list[int]] = [[]]
+    for _ in range(300):
+        done = actor.step(np.zeros(1, np.float32)).done
+        ages[-1].append(int(actor.seen.age))
+        if done:
+            ages.append([])
+    whole = {tuple(a) for a in ages[:-1]}
+    assert len(whole) > len(ages) // 2
+
+
+def test_custom_laws_are_refused_in_training(tmp_path: Path) -> None:
+    class Mine:
+        maximum = 2
+
+        def draw(self, memory: int, random: np.random.Generator) -> tuple[int, int]:
+            return 2, memory
+
+        def shifted(self, steps: int) -> "Mine":
+            return self
+
+    with pytest.raises(delayrl.DelayRLError, match=r"delayrl\.delays|is no number"):
+        train("a-sac", tmp_path / "run", delay=Delay(Channel(Mine())))  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+
+
+def test_random_action_delays_are_refused_in_training(tmp_path: Path) -> None:
+    with pytest.raises(delayrl.DelayRLError, match="constant delay") as error:
+        train("a-sac", tmp_path / "run", delay="1+action=uniform:0:2")
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_action_delay_is_a_longer_observation_delay() -> None:
+    """From its first action on, a plant whose actions are late is the plant whose observations are later by as much."""
+    late, seen = delayrl.make("Hopper-v5", "2+action=3"), delayrl.make("Hopper-v5", 5)
+    (obs, info), (other, other_info) = late.reset(seed=0), seen.reset(seed=0)
+    for _ in range(3):  # zero acts until the first action arrives
+        other, *_, other_info = seen.step(np.zeros(3, np.float32))
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        np.testing.assert_array_equal(obs, other)
+        np.testing.assert_array_equal(info["actions"], other_info["actions"])
+        assert info["age"] == other_info["age"]
+        action = rng.uniform(-1, 1, 3).astype(np.float32)
+        obs, *_, info = late.step(action)
+        other, *_, other_info = seen.step(action)

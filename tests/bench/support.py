@@ -1,0 +1,80 @@
+"""A grid that trains in seconds, and `delayrl bench` in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from delayrl.bench import folders
+from delayrl.bench.grid import Grid, load_grid
+from delayrl.run.folder import Run
+
+SAC = """
+preset = "small"
+seeds = 2
+tasks = ["Reacher-v5"]
+delays = [0]
+[overrides]
+steps = {steps}
+random_steps = 100
+replay_capacity = 150
+evaluate_every = 30
+evaluation_episodes = 1
+hidden = [8, 8]
+batch_size = 8
+[[product]]
+agents = ["sac"]
+[[product]]
+agents = ["bpql"]
+delays = [2]
+"""
+
+
+def tiny(folder: Path, steps: int = 240, name: str = "tiny", text: str = SAC) -> Path:
+    file = folder / f"{name}.toml"
+    file.write_text(text.replace("{steps}", str(steps)))
+    return file
+
+
+def bench(*words: str | Path, cache: Path) -> subprocess.Popen:
+    """A process; compiled programs are shared between its workers through a folder, so that they start sooner."""
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    command = [sys.executable, "-m", "delayrl", "bench", *map(str, words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def finish(process: subprocess.Popen, status: int = 0, timeout: float = 400) -> str:
+    out, err = process.communicate(timeout=timeout)
+    assert process.returncode == status, (out, err)
+    assert "Traceback" not in err
+    return out + err
+
+
+def assert_same_results(file: Path, one: Path, other: Path) -> None:
+    """Every cell is done, with the same rows, none twice, and the same parameters."""
+    grid: Grid = load_grid(file)
+    for cell in grid.cells:
+        assert folders.stored(one / cell.folder, cell.seeds) == (cell.steps, True)
+        pairs = (folders.seed_folders(runs / cell.folder, cell.seeds) for runs in (one, other))
+        for mine, theirs in zip(*pairs, strict=True):
+            text = (mine / "rows.jsonl").read_text()
+            assert text == (theirs / "rows.jsonl").read_text()
+            rows = [json.loads(line) for line in text.splitlines()]
+            episodes = [(row["step"], row["policy"], row["episode"]) for row in rows]
+            assert len(set(episodes)) == len(episodes) == cell.steps // 30
+            ours, others = (Run(run).latest().arrays("agent") for run in (mine, theirs))
+            for name, array in ours.items():
+                np.testing.assert_array_equal(array, others[name])
+
+
+def worker_of(folder: Path) -> int | None:
+    """The process that holds a cell."""
+    who = folders.holder(folder)
+    words = who.split() if who else []
+    return int(words[-1]) if words and words[-1].isdigit() else None

@@ -1,0 +1,317 @@
+"""Rows of a grid and the table that is published: nothing lost, nothing twice, what was used to make them."""
+
+import json
+import sqlite3
+import subprocess
+from pathlib import Path
+
+import pytest
+from support import tiny
+
+import delayrl
+from delayrl.bench import folders
+from delayrl.bench.grid import Cell, Grid, load_grid
+from delayrl.bench.results import collect, read_table, rows_of, versions_of
+from delayrl.bench.status import standing, status
+from delayrl.bench.worker import Outcome, work
+from delayrl.cli.main import main
+from delayrl.run import provenance
+from delayrl.run.folder import Run
+
+MIXED = """
+preset = "small"
+seeds = 2
+tasks = ["Reacher-v5"]
+delays = [2]
+[overrides]
+steps = 60
+random_steps = 20
+replay_capacity = 50
+evaluate_every = 30
+evaluation_episodes = 2
+[[product]]
+agents = ["random"]
+[[product]]
+agents = ["random"]
+protocol = "official"
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Grid, Path]:
+    """A grid with one cell done, worked on in this process, and one not begun."""
+    home = tmp_path_factory.mktemp("finished")
+    grid = load_grid(tiny(home, text=MIXED, name="mixed"))
+    assert work_on(grid.cells[0], home / "runs") == Outcome("done", "")
+    return grid, home / "runs"
+
+
+def work_on(cell: Cell, runs: Path) -> Outcome:
+    folders.prepare(runs / cell.folder, cell)
+    return work(runs / cell.folder)
+
+
+def test_round_trip(finished, tmp_path: Path) -> None:
+    """The table gives back the rows of the folders, exactly; of cells not begun it says so."""
+    grid, runs = finished
+    expected = list(rows_of(grid.cells[:1], runs))
+    assert len(expected) == 2 * 2 * 2
+    assert expected[0] | {"cell": grid.cells[0].id} == expected[0]
+    assert collect(grid, runs, tmp_path / "mixed.sqlite") == len(expected)
+    rows, cells, used = read_table(tmp_path / "mixed.sqlite")
+    assert rows == expected
+    assert cells == standing(grid.cells, runs)
+    assert used == versions_of(grid.cells, runs)
+    assert used[0]["cores"]
+    assert [(p.state, p.step) for _, p in cells] == [("done", 60), ("todo", 0)]
+    assert [status(cell, runs) for cell in grid.cells] == ["done", "todo"]
+
+
+def test_the_same_rows_give_the_same_bytes(finished, tmp_path: Path) -> None:
+    grid, runs = finished
+    for name in ("a.sqlite", "b.sqlite", "b.sqlite"):
+        collect(grid, runs, tmp_path / name)
+    assert (tmp_path / "a.sqlite").read_bytes() == (tmp_path / "b.sqlite").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.sqlite", "b.sqlite"]
+
+
+def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> None:
+    """Unknown columns come back, whether they hold for the run or differ; every version that worked on it is named."""
+    grid, runs = finished
+    cell = Cell(**(vars(grid.cells[0]) | {"id": "0123"}))
+    run = Run(runs / cell.folder / "seed0")
+    source = Run(runs / grid.cells[0].folder / "seed0")
+    run.create({k: v for k, v in source.config.items() if k != "format"})
+    rows = source.read("rows")
+    for i, row in enumerate(rows):
+        run.append("rows", [row | {"physics": "ab12", "mujoco": "3.2.7" if i else "3.5.0", "return": 0.1 + 1e-17 * i}])
+    folders.note(runs / cell.folder, "begun", versions={"jax": "0.10", "device": "other"})
+    alone = Grid("alone", "", Path("alone.toml"), (cell,))
+    collect(alone, runs, tmp_path / "t.sqlite")
+    assert read_table(tmp_path / "t.sqlite")[0] == list(rows_of([cell], runs))
+    table = sqlite3.connect(tmp_path / "t.sqlite")
+    config, versions = table.execute("SELECT config, versions FROM runs").fetchone()
+    table.close()
+    assert json.loads(config)["hyperparameters"] == source.config["hyperparameters"]
+    assert [v.get("jax") for v in json.loads(versions)] == [source.config["versions"]["jax"], "0.10"]
+    assert {"commit", "device", "mujoco", "gymnasium"} <= set(json.loads(versions)[0])
+
+
+def test_plain_sql(finished, tmp_path: Path) -> None:
+    """Somebody without this library reads it."""
+    grid, runs = finished
+    collect(grid, runs, tmp_path / "t.sqlite")
+    table = sqlite3.connect(tmp_path / "t.sqlite")
+    query = "SELECT agent, env, delay, avg(return) FROM results WHERE step = 60 GROUP BY agent, env, delay"
+    (found,) = table.execute(query).fetchall()
+    table.close()
+    returns = [row["return"] for row in rows_of(grid.cells, runs) if row["step"] == 60]
+    assert found[:3] == ("random", "Reacher-v5", 2)
+    assert found[3] == pytest.approx(sum(returns) / len(returns))
+
+
+def test_bad_tables(finished, tmp_path: Path) -> None:
+    """One line each, and what was there stays."""
+    grid, runs = finished
+    file = tmp_path / "t.sqlite"
+    with pytest.raises(delayrl.DelayRLError, match="there is no table"):
+        read_table(file)
+    collect(grid, runs, file)
+    with sqlite3.connect(file) as table:
+        table.execute("UPDATE meta SET value = '2' WHERE key = 'schema'")
+    table.close()
+    before = file.read_bytes()
+    for what in (lambda: read_table(file), lambda: collect(grid, runs, file)):
+        with pytest.raises(delayrl.DelayRLError, match="schema version 2, this program reads 1") as error:
+            what()
+        assert "\n" not in str(error.value)
+    assert file.read_bytes() == before
+    for content in (b"", b"not a table", before[: len(before) // 2], before[:5000] + b"\0" * (len(before) - 5000)):
+        file.write_bytes(content)
+        with pytest.raises(delayrl.DelayRLError, match="no table of results, or damaged"):
+            read_table(file)
+    file.unlink()
+    collect(grid, runs, file)
+    with pytest.raises(delayrl.DelayRLError, match="the table of the grid 'mixed'"):
+        collect(Grid("other", "", grid.source, grid.cells), runs, file)
+    with pytest.raises(delayrl.DelayRLError, match="has no rows"):
+        collect(grid, tmp_path / "elsewhere", tmp_path / "none.sqlite")
+    assert not (tmp_path / "none.sqlite").exists()
+
+
+def test_an_episode_twice(finished, tmp_path: Path) -> None:
+    grid, runs = finished
+    cell = Cell(**(vars(grid.cells[0]) | {"id": "4567"}))
+    run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
+    run.create({k: v for k, v in source.config.items() if k != "format"})
+    run.append("rows", source.read("rows")[:2] + source.read("rows")[:1])
+    with pytest.raises(delayrl.DelayRLError, match="holds an episode twice"):
+        collect(Grid("twice", "", Path("twice.toml"), (cell,)), runs, tmp_path / "t.sqlite")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("change", ["{}", "5", '"step": null', '"return": NaN', '"return": "1"'])
+def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
+    """One line, from the report and before anything is published."""
+    grid, runs = finished
+    cell = Cell(**(vars(grid.cells[0]) | {"id": "5678"}))
+    run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
+    run.remove()
+    run.create({k: v for k, v in source.config.items() if k != "format"})
+    run.append("rows", source.read("rows"))
+    line = json.dumps(source.read("rows")[0] | json.loads(f"{{{change}}}")) if ":" in change else change
+    with open(run.path / "rows.jsonl", "a") as file:
+        file.write(line + "\n")
+    alone = Grid("alone", "", Path("alone.toml"), (cell,))
+    for what in (lambda: collect(alone, runs, tmp_path / "t.sqlite"), lambda: list(rows_of([cell], runs))):
+        with pytest.raises(delayrl.DelayRLError, match=r"seed0 holds a damaged row: ") as error:
+            what()
+        assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_worker(finished, tmp_path: Path) -> None:
+    """A finished cell is left alone; a held one too; a mistake is one line, and the cell's state."""
+    grid, runs = finished
+    home = runs / grid.cells[0].folder
+    before = (home / "journal.jsonl").read_text()
+    assert work(home) == Outcome("done", "")
+    assert (home / "journal.jsonl").read_text() == before
+    (home / "journal.jsonl").write_text(before.splitlines(keepends=True)[0])  # killed before it could say "done"
+    for _ in range(2):
+        assert work(home) == Outcome("done", "")
+        assert [event["event"] for event in folders.journal(home)] == ["begun", "done"]
+    with folders.hold(home):
+        assert work(home).kind == "locked"
+        assert status(grid.cells[0], runs) == "running"
+    wrong = Cell(**(vars(grid.cells[0]) | {"id": "89ab", "delay": 50}))
+    assert work_on(wrong, tmp_path).kind == "failed"
+    assert "no shorter than an episode" in work(tmp_path / wrong.folder).line
+    (tmp_path / wrong.folder / "cell.json").write_text("{")
+    assert work(tmp_path / wrong.folder).kind == "died"
+
+
+def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
+    """plan, status and collect as they are typed."""
+    grid, runs = finished
+    words = [str(grid.source), "--runs", str(runs)]
+    main(["bench", "plan", *words])
+    out = capsys.readouterr().out
+    assert all(cell.id in out for cell in grid.cells)
+    assert "mixed: 2 cells, 4 runs, 240 steps" in out
+    main(["bench", "status", *words])
+    out = capsys.readouterr().out
+    assert "60 / 60" in out
+    assert "1/2 cells · 50 % of the steps" in out
+    folders.prepare(runs / grid.cells[1].folder, grid.cells[1])
+    folders.note(runs / grid.cells[1].folder, "failed", line="the disk is full")
+    main(["bench", "status", *words])
+    out = capsys.readouterr().out
+    assert f"failed: {grid.cells[1]} ({grid.cells[1].id}): the disk is full" in out
+    (runs / grid.cells[1].folder / "journal.jsonl").unlink()
+    main(["bench", "collect", *words, "--out", str(tmp_path / "t.sqlite")])
+    assert "8 rows; 1 of 2 cells are done" in capsys.readouterr().out
+
+
+def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkeypatch) -> None:
+    """Not by hundreds of numbers."""
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("\n".join("1234" * 100))
+    file = tiny(tmp_path, text=MIXED.replace("delays = [2]", 'delays = ["recorded:log.csv"]'), name="recorded")
+    cell = load_grid(file).cells[0]
+    assert len(cell.delay) > 400
+    assert work_on(cell, Path("runs")) == Outcome("done", "")
+    (label,) = {row["delay"] for row in rows_of([cell], Path("runs"))}
+    for command in ("plan", "status", "report"):
+        main(["bench", command, str(file), "--runs", "runs"])
+        out = capsys.readouterr().out
+        assert label in out or command == "report"
+        assert "1,2,3,4,1" not in out
+    text = Path("runs/recorded-report/report.md").read_text()
+    assert label in text
+    assert "1,2,3,4,1" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("plan nosuch", "unknown grid 'nosuch'; give a .toml file, or one of first"),
+        ("plan ./nosuch.toml", "there is no grid file nosuch.toml"),
+        ("run smoke --cells 123", "has no cell 123"),
+        ("run smoke --workers 0", "--workers must be at least 1"),
+        ("run smoke --tries 0", "--tries must be at least 1"),
+        ("run smoke --time-limit 9", "a time is written as"),
+        ("run smoke --backend cloud", "invalid choice"),
+        ("collect smoke", "has no rows"),
+        ("fly smoke", "invalid choice"),
+        ("", "required"),
+    ],
+)
+def test_bad_commands(words: str, expected: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["bench", *words.split()])
+    captured = capsys.readouterr()
+    assert end.value.code == 2
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert expected in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_commit(tmp_path: Path, monkeypatch) -> None:
+    """That of our checkout, marked where it was changed; not that of a project that has us in its environment."""
+
+    def git(*words: str) -> str:
+        author = ("-c", "user.name=a", "-c", "user.email=a@b")
+        command = ["git", "-C", str(tmp_path), *author, *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    package = tmp_path / "environment" / "delayrl"
+    package.mkdir(parents=True)
+    (package / "provenance.py").write_text("")
+    monkeypatch.setattr(provenance, "__file__", str(package / "provenance.py"))
+    assert provenance.commit() is None
+    git("init", "--quiet")
+    (tmp_path / ".gitignore").write_text("environment")
+    git("add", ".gitignore")
+    git("commit", "--quiet", "-m", "theirs")
+    assert provenance.commit() is None
+    git("add", "--force", "environment")
+    git("commit", "--quiet", "-m", "ours")
+    assert provenance.commit() == git("rev-parse", "--short=12", "HEAD")
+    (package / "provenance.py").write_text("1")
+    assert provenance.commit() == git("rev-parse", "--short=12", "HEAD") + "-changed"
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("cell", '{"agent": 5}'),
+        ("cell", '{"env": null}'),
+        ("cell", '{"overrides": []}'),
+        ("cell", '{"steps": "x"}'),
+        ("cell", '{"seeds": {}}'),
+        ("state", '"gone"'),
+        ("step", '"x"'),
+        ("versions", "[5]"),
+    ],
+)
+def test_a_table_with_wrong_types(finished, tmp_path: Path, column: str, value: str, capsys) -> None:
+    """It may be from anywhere: one line."""
+    grid, runs = finished
+    file = tmp_path / "t.sqlite"
+    collect(grid, runs, file)
+    with sqlite3.connect(file) as table:
+        where = "runs" if column == "versions" else "cells"
+        if column == "cell":
+            table.execute("UPDATE cells SET cell = json_patch(cell, ?)", (value,))
+        else:
+            table.execute(f"UPDATE {where} SET {column} = ?", (value if column == "versions" else json.loads(value),))
+    table.close()
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "report", str(file)])
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "is no table of results, or damaged: " in error

@@ -1,0 +1,354 @@
+"""Working off a grid on this machine: skipped, resumed, retried, stopped, locked."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support import assert_same_results, bench, finish, tiny, worker_of
+
+import delayrl
+from delayrl.bench import folders
+from delayrl.bench.grid import Cell, load_grid
+from delayrl.bench.runner import Local, work_off
+from delayrl.bench.status import line, seconds_left, standing
+from delayrl.bench.worker import Outcome
+from delayrl.cli.bench import seconds
+from delayrl.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[Path, Path]:
+    """The tiny grid and its finished runs."""
+    home = tmp_path_factory.mktemp("undisturbed")
+    file = tiny(home)
+    finish(bench("run", file, "--runs", home / "runs", cache=cache))
+    return file, home / "runs"
+
+
+def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int, within: float) -> int:
+    """Run a grid, killing workers at random, some seconds apart; how many were killed."""
+    cells, rng, killed = load_grid(file).cells, random.Random(kills), 0
+    process = bench("run", file, "--runs", runs, "--workers", workers, "--tries", kills + 1, cache=cache)
+    try:
+        next_kill = time.monotonic() + rng.uniform(0, within)
+        while process.poll() is None:
+            time.sleep(0.05)
+            busy = [pid for cell in cells if (pid := worker_of(runs / cell.folder))]
+            if killed < kills and busy and time.monotonic() > next_kill:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(rng.choice(busy), signal.SIGKILL)
+                    killed += 1
+                next_kill = time.monotonic() + rng.uniform(0, within)
+        finish(process)
+    finally:
+        process.kill()
+        process.communicate()
+    return killed
+
+
+def ends(runs: Path, file: Path) -> list[int]:
+    """How often each cell's journal says that it was finished."""
+    cells = load_grid(file).cells
+    return [sum(e["event"] == "done" for e in folders.journal(runs / cell.folder)) for cell in cells]
+
+
+def test_workers_killed(undisturbed, tmp_path: Path, cache: Path) -> None:
+    """Every cell ends once, no row is lost or double, results are those of the undisturbed grid."""
+    file, expected = undisturbed
+    assert chaos(file, tmp_path / "runs", cache, kills=2, workers=2, within=1) == 2
+    assert_same_results(file, tmp_path / "runs", expected)
+    assert ends(tmp_path / "runs", file) == [1, 1]
+
+
+@pytest.mark.slow
+def test_workers_killed_twenty_times(tmp_path: Path, cache: Path) -> None:
+    file = tiny(tmp_path, steps=3000)
+    finish(bench("run", file, "--runs", tmp_path / "expected", cache=cache))
+    assert chaos(file, tmp_path / "runs", cache, kills=20, workers=2, within=8) == 20
+    assert_same_results(file, tmp_path / "runs", tmp_path / "expected")
+    assert ends(tmp_path / "runs", file) == [1, 1]
+
+
+def test_finished_cells_are_skipped(undisturbed, cache: Path) -> None:
+    file, runs = undisturbed
+    before = {path: path.stat().st_mtime_ns for path in runs.rglob("*.jsonl")}
+    assert "2 of 2 cells done" in finish(bench("run", file, "--runs", runs, cache=cache))
+    assert before == {path: path.stat().st_mtime_ns for path in runs.rglob("*.jsonl")}
+
+
+def test_time_limit(tmp_path: Path, cache: Path) -> None:
+    """Stopped at a checkpoint, status 75, nothing holds the cells; the same command goes on from there."""
+    file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
+    cells, reached = load_grid(file).cells, 0
+    for advances in range(2):
+        for _ in range(6):  # on a slow machine compiling takes the whole time
+            said = finish(bench("run", file, "--runs", runs, "--time-limit", "10s", cache=cache), 75)
+            assert "0 of 2 cells done" in said
+            assert "the same command goes on" in said
+            now = [p for _, p in standing(cells, runs)]
+            assert [p.state for p in now] == ["todo", "todo"]
+            before, reached = reached, sum(p.step for p in now)
+            assert reached >= before
+            if reached > before:
+                break
+        else:
+            pytest.fail(f"nothing new after {advances} times")
+    assert "stopped" in [e["event"] for e in folders.journal(runs / cells[0].folder)]
+
+
+def test_stopped_or_killed_runner(undisturbed, tmp_path: Path, cache: Path) -> None:
+    """SIGTERM stops the workers with it; when the runner is killed, its workers notice and store a checkpoint."""
+    file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
+    cell = load_grid(file).cells[0]
+    for kind, status in ((signal.SIGTERM, 75), (signal.SIGKILL, -signal.SIGKILL)):
+        step = folders.stored(runs / cell.folder, cell.seeds)[0]
+        process = bench("run", file, "--runs", runs, "--cells", cell.id, cache=cache)
+        until(lambda step=step: folders.stored(runs / cell.folder, cell.seeds)[0] > step)
+        process.send_signal(kind)
+        process.communicate(timeout=60)
+        assert process.returncode == status
+        until(lambda: folders.holder(runs / cell.folder) is None)
+        assert folders.journal(runs / cell.folder)[-1]["event"] == "stopped"
+
+
+def until(condition, timeout: float = 120) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def test_two_runners(undisturbed, tmp_path: Path, cache: Path) -> None:
+    """Side by side on one grid: each cell is begun once and finished once, both runners end well."""
+    file, runs = tiny(tmp_path), tmp_path / "runs"
+    both = [bench("run", file, "--runs", runs, cache=cache) for _ in range(2)]
+    assert all("2 of 2 cells done" in finish(process) for process in both)
+    for cell in load_grid(file).cells:
+        assert [e["event"] for e in folders.journal(runs / cell.folder)] == ["begun", "done"]
+    assert_same_results(file, runs, undisturbed[1])
+
+
+SMALL_DISK = """
+set -e
+mkdir -p "$1"; mount -t tmpfs -o size=$2 none "$1"
+shift 2; status=0; "$@" || status=$?
+cp -r "$RUNS" "$KEPT"
+exit $status
+"""
+
+
+def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
+    """A real one. One line, and not tried again; with room the grid goes on, and no row is lost or double."""
+    file, expected = undisturbed
+    if subprocess.run(["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode:
+        pytest.skip("no file system can be mounted here")
+    disk, kept = tmp_path / "disk", tmp_path / "kept"
+    command = [
+        sys.executable,
+        "-m",
+        "delayrl",
+        "bench",
+        "run",
+        str(file),
+        "--runs",
+        str(disk / "runs"),
+        "--workers",
+        "1",
+    ]
+    done = subprocess.run(
+        ["unshare", "-rm", "bash", "-c", SMALL_DISK, "-", str(disk), "240k", *command],
+        env=os.environ | {"RUNS": str(disk / "runs"), "KEPT": str(kept), "JAX_COMPILATION_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2, (done.stdout, done.stderr)
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("delayrl: ")
+    assert "No space left on device" in last or "the disk is full" in last
+    step = [folders.stored(kept / cell.folder, cell.seeds)[0] for cell in load_grid(file).cells]
+    assert any(0 < n < 240 for n in step)
+    finish(bench("run", file, "--runs", kept, cache=cache))
+    assert_same_results(file, kept, expected)
+
+
+# -- without training ------------------------------------------------------------------------------------------------
+
+
+class Script:
+    """A backend whose cells end as they are told."""
+
+    def __init__(self, **outcomes: list[Outcome]):
+        self.outcomes, self.running, self.started = outcomes, list[Cell](), list[str]()
+
+    def room(self) -> int:
+        return 1 - len(self.running)
+
+    def start(self, cell: Cell) -> None:
+        self.running.append(cell)
+        self.started.append(cell.agent)
+
+    def ended(self) -> list[tuple[Cell, Outcome]]:
+        running, self.running = self.running, []
+        return [(cell, self.outcomes[cell.agent].pop(0)) for cell in running]
+
+    def stop(self) -> None: ...
+    def close(self) -> None: ...
+
+
+def cells(*agents: str) -> list[Cell]:
+    return [Cell(agent, "Reacher-v5", 0, "small", "corrected", (0,), {}, 100, agent) for agent in agents]
+
+
+DIED, DONE, WRONG = Outcome("died", "killed by SIGKILL"), Outcome("done", ""), Outcome("failed", "discount: no")
+
+
+@pytest.fixture(autouse=True)
+def short_pause(monkeypatch) -> None:
+    monkeypatch.setattr("delayrl.bench.runner.PAUSE", 0.01)
+
+
+def test_tries_are_bounded(tmp_path: Path) -> None:
+    """Only those in a row that store nothing new count; a mistake is not tried again; the others go on."""
+    backend = Script(sac=[DIED] * 9, bpql=[DIED, DIED, DONE], vdpo=[WRONG, DONE])
+    began = time.monotonic()
+    report = work_off(cells("sac", "bpql", "vdpo"), tmp_path, backend, tries=3)
+    assert time.monotonic() - began > 2 + 4  # longer from time to time
+    assert [backend.started.count(agent) for agent in ("sac", "bpql", "vdpo")] == [3, 3, 1]
+    assert [cell.agent for cell in report.done] == ["bpql"]
+    assert report.failed == {"sac": "3 tries stored nothing new; the last: killed by SIGKILL", "vdpo": "discount: no"}
+    now = standing(cells("sac", "bpql", "vdpo"), tmp_path)
+    assert [p.state for _, p in now] == ["failed", "todo", "failed"]
+    assert now[0][1].line == report.failed["sac"]
+    assert "2 failed" in line(now, 1)
+
+
+def test_a_worker_that_cannot_be_started(tmp_path: Path) -> None:
+    """Its cell has failed, the others go on."""
+
+    class Refuses(Script):
+        def start(self, cell: Cell) -> None:
+            if cell.agent == "sac":
+                raise delayrl.DelayRLError("the disk is full")
+            super().start(cell)
+
+    report = work_off(cells("sac", "bpql"), tmp_path, Refuses(bpql=[DONE]))
+    assert report.failed == {"sac": "the disk is full"}
+    assert [cell.agent for cell in report.done] == ["bpql"]
+    assert [p.state for _, p in standing(cells("sac"), tmp_path)] == ["failed"]
+
+
+def test_tries_with_progress_do_not_count(tmp_path: Path, monkeypatch) -> None:
+    steps = iter([0, 0, 0, 10, 10, 20, 20, 30])
+    monkeypatch.setattr(folders, "stored", lambda *_: (next(steps), False))
+    backend = Script(sac=[DIED] * 5 + [DONE])
+    assert work_off(cells("sac"), tmp_path, backend, tries=2).failed == {}
+    assert len(backend.started) == 6
+
+
+def test_a_cell_of_another_runner_is_waited_for(tmp_path: Path) -> None:
+    locked = Outcome("locked", "another process works on it")
+    backend = Script(sac=[locked, DONE], bpql=[DONE])
+    report = work_off(cells("sac", "bpql"), tmp_path, backend, tries=1)
+    assert backend.started == ["sac", "bpql", "sac"]
+    assert len(report.done) == 2
+
+
+def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
+    """Or the log of the worker that holds it would be emptied, again and again."""
+    backend, some = Script(sac=[DONE], bpql=[DONE]), cells("sac", "bpql")
+    folders.prepare(tmp_path / some[0].folder, some[0])
+    with contextlib.ExitStack() as held:
+        held.enter_context(folders.hold(tmp_path / some[0].folder))
+        free = time.monotonic() + 0.5
+
+        def tick() -> None:
+            if time.monotonic() > free:
+                held.close()
+            else:
+                assert "sac" not in backend.started
+
+        assert len(work_off(some, tmp_path, backend, tick=tick).done) == 2
+    assert backend.started == ["bpql", "sac"]
+
+
+def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> None:
+    """After the grace, so that a queue's wall-clock limit holds."""
+    sleep = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
+
+    def start(folder: Path, device: str | None) -> subprocess.Popen:
+        return subprocess.Popen([sys.executable, "-c", sleep], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    monkeypatch.setattr("delayrl.bench.runner.start_worker", start)
+    began, backend = time.monotonic(), Local(tmp_path, 1)
+    report = work_off(cells("sac", "bpql"), tmp_path, backend, time_limit=1, grace=1)
+    assert time.monotonic() - began < 20
+    assert {cell.agent for cell in report.left} == {"sac", "bpql"}
+
+
+def test_journal_after_a_crash(tmp_path: Path) -> None:
+    """A line that was cut off does not swallow the next one."""
+    folders.note(tmp_path, "begun")
+    with open(tmp_path / "journal.jsonl", "a") as file:
+        file.write('{"event": "do')
+    folders.note(tmp_path, "begun", versions={"jax": "1"})
+    folders.note(tmp_path, "done")
+    assert [e["event"] for e in folders.journal(tmp_path)] == ["begun", "begun", "done"]
+    assert folders.journal(tmp_path)[1]["versions"] == {"jax": "1"}
+
+
+def test_lock(tmp_path: Path) -> None:
+    """One holder; gone with its process; looking does not take it."""
+    assert folders.holder(tmp_path) is None
+    code = f"from delayrl.bench.folders import *\nwith hold(Path({str(tmp_path)!r})): print(1, flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "1\n"
+        assert folders.holder(tmp_path).endswith(f" {other.pid}")
+        with pytest.raises(folders.LockedError), folders.hold(tmp_path, patience=0.1):
+            pass
+        other.kill()
+        other.communicate()
+    assert folders.holder(tmp_path) is None
+    with folders.hold(tmp_path):
+        assert folders.holder(tmp_path).endswith(f" {os.getpid()}")
+
+
+def test_time_left(tmp_path: Path) -> None:
+    """At the speed of the same agent on the same task, else of the agent, else of all."""
+    some = cells("sac", "bpql", "vdpo")
+    states = [("done", 100, 10.0), ("running", 50, 5.0), ("todo", 0, None)]
+    now = [(cell, folders.Progress(*state, "")) for cell, state in zip(some, states, strict=True)]
+    assert seconds_left(now, 1) == pytest.approx(50 / 5 + 100 / 7.5)
+    assert seconds_left(now, 2) == pytest.approx(100 / 7.5)  # the longest cell alone
+    assert seconds_left([(some[0], folders.Progress("todo", 0, None, ""))], 1) is None
+    assert seconds_left(now[:1], 1) == 0
+
+
+@pytest.mark.parametrize(("text", "value"), [("90s", 90), ("9m", 540), ("1h30m", 5400), ("2d", 172800)])
+def test_times(text: str, value: int) -> None:
+    assert seconds(text) == value
+    for bad in (text + "x", "", "9", "m", "0s"):
+        with pytest.raises(delayrl.DelayRLError, match="a time is written as"):
+            seconds(bad)
+
+
+@pytest.mark.parametrize("option", ["--submit", "--sbatch=--partition=gpu", "--address=auto", "--gpus=1"])
+def test_options_of_another_backend_are_not_ignored(option: str, capsys) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["bench", "run", "smoke", option])
+    assert stopped.value.code == 2
+    name, backend = option.split("=")[0], "slurm" if option.startswith("--s") else "ray"
+    assert capsys.readouterr().err.strip() == f"delayrl: {name} needs --backend {backend}; got --backend local"

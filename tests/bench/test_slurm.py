@@ -1,0 +1,118 @@
+"""Slurm: the script, and a real Slurm of one node. Skipped where slurm-wlm and munge are not installed."""
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support import assert_same_results, bench, finish, tiny
+
+import delayrl
+from delayrl.bench import folders
+from delayrl.bench.grid import load_grid
+from delayrl.bench.slurm import script, submit
+from delayrl.cli.bench import bench as command
+
+NODE = Path(__file__).with_name("slurm_node.sh")
+PROGRAMS = ("slurmctld", "slurmd", "munged")
+PATH = f"{os.environ['PATH']}:/usr/sbin"
+needs_slurm = pytest.mark.skipif(
+    not all(shutil.which(name, path=PATH) for name in PROGRAMS), reason="Slurm is not installed"
+)
+
+
+def test_script(tmp_path: Path) -> None:
+    """An array with one element for each cell, in bash, with room between stopping and the queue's limit."""
+    grid = load_grid(tiny(tmp_path))
+    text = script(grid, grid.cells, tmp_path / "my runs", time_limit=600, options=["--partition=gpu"])
+    assert "#SBATCH --array=0-1\n" in text
+    assert "#SBATCH --partition=gpu\n" in text
+    assert "#SBATCH --requeue\n" in text
+    assert f"cells=({' '.join(grid.ids)})" in text
+    assert "--time-limit 600s" in text
+    minutes, before = (int(re.search(f"{key}(\\d+)", text).group(1)) for key in ("--time=", "B:TERM@"))
+    assert minutes * 60 - before >= 600
+    subprocess.run(["bash", "-n"], input=text, text=True, check=True)
+    with pytest.raises(delayrl.DelayRLError, match="--sbatch takes an option"):
+        script(grid, grid.cells, tmp_path, options=["--x\nrm"])
+
+
+def test_written_for_another_machine(tmp_path: Path, capsys, monkeypatch) -> None:
+    """Without --submit nothing is submitted; without sbatch one line says so; finished cells are left out."""
+    file = tiny(tmp_path)
+    words = ["run", str(file), "--runs", str(tmp_path / "runs"), "--backend", "slurm"]
+    command(words)
+    path = tmp_path / "runs" / "slurm" / "tiny.sbatch"
+    assert capsys.readouterr().out == f"{path}: 2 cells\nnext: sbatch {path}\n"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(delayrl.DelayRLError, match="there is no sbatch here"):
+        submit(path)
+    monkeypatch.setattr("delayrl.cli.bench.status", lambda *_: "done")
+    command(words)
+    assert "all 2 cells are done" in capsys.readouterr().out
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """The environment in which commands of Slurm reach a node of our own."""
+    home = tmp_path / "slurm"
+    with socket.create_server(("", 0)) as one, socket.create_server(("", 0)) as other:
+        ports = [str(server.getsockname()[1]) for server in (one, other)]
+    process = subprocess.Popen(
+        [NODE, home, *ports], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    environment = os.environ | {"SLURM_CONF": str(home / "slurm.conf")}
+    try:
+        deadline = time.monotonic() + 60
+        while "idle" not in subprocess.run(["sinfo"], capture_output=True, text=True, env=environment).stdout:
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.5)
+        yield environment
+    finally:
+        process.stdin.close()
+        process.wait(30)
+
+
+@needs_slurm
+@pytest.mark.slow
+def test_a_real_slurm(node: dict[str, str], tmp_path: Path, monkeypatch) -> None:
+    """Cut by the time limit and by a signal, queued again each time, and the same results in the end."""
+    file, runs = tiny(tmp_path, steps=3000), tmp_path / "runs"
+    finish(bench("run", file, "--runs", tmp_path / "expected", cache=tmp_path / "cache"))
+    for name in ("SLURM_CONF", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.setenv(name, node.get(name, str(tmp_path / "cache")))
+
+    def scontrol(*words: str) -> str:
+        return subprocess.run(["scontrol", *words], capture_output=True, text=True, check=True).stdout
+
+    words = ["run", file, "--runs", runs, "--backend", "slurm", "--time-limit", "12s", "--submit"]
+    job = re.search(r"job (\d+)", finish(bench(*words, cache=tmp_path / "cache"))).group(1)
+    cells, restarts, signalled, released = load_grid(file).cells, 0, False, {(0, "0"), (1, "0")}
+    deadline = time.monotonic() + 900
+    while not all(folders.stored(runs / cell.folder, cell.seeds)[1] for cell in cells):
+        assert time.monotonic() < deadline, scontrol("show", "job", job)
+        for number, cell in enumerate(cells):
+            shown = subprocess.run(
+                ["scontrol", "show", "job", f"{job}_{number}"], capture_output=True, text=True
+            ).stdout
+            found = re.search(r"Restarts=(\d+)", shown)
+            restarts = max(restarts, int(found.group(1)) if found else 0)
+            if "JobState=PENDING" in shown and found and (number, found.group(1)) not in released:
+                released.add((number, found.group(1)))  # two minutes otherwise; a node needs some seconds to forget
+                scontrol("update", f"JobId={job}_{number}", "StartTime=now+15")
+            halfway = folders.stored(runs / cell.folder, cell.seeds)[0] > 1500
+            if "JobState=RUNNING" in shown and halfway and not signalled and folders.holder(runs / cell.folder):
+                subprocess.run(["scancel", "--batch", "--signal=TERM", f"{job}_{number}"], check=True)
+                signalled = True
+        time.sleep(0.5)
+    assert restarts >= 1
+    assert signalled
+    assert any("stopped at a checkpoint" in log.read_text() for log in (runs / "slurm").glob("tiny-*.log"))
+    time.sleep(3)  # the last job ends
+    assert_same_results(file, runs, tmp_path / "expected")

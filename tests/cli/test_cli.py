@@ -1,0 +1,158 @@
+"""What a user types. Errors: one line on stderr, exit status 2, no traceback."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from delayrl.agents.registry import AGENTS
+from delayrl.cli.main import main
+from delayrl.run.configuration import options
+from delayrl.run.folder import Run
+
+SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
+SMALL += ["--batch-size", "8", "--hidden", "8", "8"]
+TINY = [*SMALL, "--width", "8", "--layers", "1", "--clone-every", "40", "--clone-updates", "3", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cli") / "run"
+    main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "3", "--out", str(path), *TINY])
+    return path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(list(arguments))
+    captured = capsys.readouterr()
+    assert end.value.code == 2
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith("delayrl: ")
+    return captured.err
+
+
+def test_train_ends_with_a_summary(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same command on a complete run says so, trains nothing, and shows the summary again."""
+    main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "3", "--out", str(run), *TINY[:-1]])
+    out, err = capsys.readouterr()
+    assert "found complete at step 240" in err
+    for words in ("return under delay", "its reference, no delay", str(run), "delayrl evaluate", "curve.png"):
+        assert words in out
+
+
+def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["evaluate", str(run), "--episodes", "3", "--seed", "1", "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert list(result) == ["agent", "env", "delay", "episodes", "mean_return", "std_return", "returns"]
+    assert (result["agent"], result["delay"], len(result["returns"])) == ("vdpo", 3, 3)
+    assert result["mean_return"] == pytest.approx(sum(result["returns"]) / 3)
+    main(["evaluate", str(run), "--episodes", "3", "--delay", "1"])
+    assert "delay 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["gif", "mp4"])
+def test_watch(run: Path, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In a process of its own: rendering needs a fresh MuJoCo. Where there is no EGL, one line says so."""
+    out = tmp_path / f"episode.{kind}"
+    done = subprocess.run(
+        [sys.executable, "-m", "delayrl", "watch", str(run), "--out", str(out)], capture_output=True, text=True
+    )
+    if done.returncode == 0:
+        assert out.stat().st_size > 3000
+        assert "50 frames" in done.stdout
+    else:
+        assert "cannot be rendered here" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["agents"])
+    out = capsys.readouterr().out
+    assert all(name in out for name in AGENTS)
+    main(["tasks"])
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("Ant-v5", "Humanoid-v5", "delayrl/Pusher-v4", "InvertedPendulum-v5"))
+
+
+@pytest.mark.parametrize("agent", list(AGENTS))
+def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["train", agent, "--preset", "small", "--help"])
+    assert end.value.code == 0
+    out = " ".join(capsys.readouterr().out.split())
+    preset = AGENTS[agent].presets["small"]
+    for option in (*options(preset.agent), *options(preset.schedule)):
+        assert f"--{option.name.replace('_', '-')}" in out
+        assert option.help in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("train", "name the agent"),
+        ("train vpdo --env Reacher-v5 --delay 3", "did you mean vdpo"),
+        ("train vdpo --delay 3", "--env"),
+        ("train vdpo --env InvertedPendlum-v5 --delay 3", "did you mean InvertedPendulum"),
+        ("train vdpo --env Reacher-v5 --delay -3", "negative"),
+        ("train vdpo --env Reacher-v5 --delay 2.5", "whole"),
+        ("train vdpo --env Reacher-v5 --delay some", "number"),
+        ("train vdpo --env Reacher-v5 --delay 50", "no shorter than an episode"),
+        ("train vdpo --env Reacher-v5", "at least 1 step"),
+        ("train sac --env Reacher-v5 --delay 3", "delay-free reference"),
+        ("train vdpo --env CartPole-v1 --delay 3", "continuous"),
+        ("train vdpo --env Reacher-v5 --delay 3 --learnin-rate 3", "did you mean learning_rate"),
+        ("train vdpo --env Reacher-v5 --delay 3 --learning-rate high", "invalid float"),
+        ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
+        ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
+        ("evaluate nowhere", "not a run folder"),
+        ("watch nowhere --out x.gif", "not a run folder"),
+        ("watch nowhere --out x.avi", ".mp4 or .gif"),
+        ("fly", "invalid choice"),
+        ("", "required"),
+    ],
+)
+def test_bad_input(arguments: str, words: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(capsys, *arguments.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_run_folders(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(run, broken)
+    assert "up to 3" in refused(capsys, "evaluate", str(broken), "--delay", "4")
+    assert "at least 1" in refused(capsys, "evaluate", str(broken), "--episodes", "0")
+    for folder in (broken / "checkpoints").iterdir():
+        weights = folder / "agent.safetensors"
+        weights.write_bytes(weights.read_bytes()[:1000])
+    assert "cut or changed" in refused(capsys, "evaluate", str(broken))
+    (broken / "config.json").write_text("{")
+    assert "damaged" in refused(capsys, "evaluate", str(broken))
+
+
+def test_stopped_run_goes_on(tmp_path: Path) -> None:
+    """A polite kill ends the process at a checkpoint, with one line; the same command finishes the run."""
+    command = [sys.executable, "-m", "delayrl", "train", "a-sac", "--env", "Reacher-v5", "--delay", "2"]
+    command += ["--out", str(tmp_path / "run"), *SMALL, "--steps", "100000", "--random-steps", "99000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for _ in range(600):
+        if (tmp_path / "run" / "checkpoints").exists():
+            break
+        try:
+            process.wait(0.2)
+        except subprocess.TimeoutExpired:
+            continue
+    process.terminate()
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "goes on from there" in err
+    assert "Traceback" not in err
+    stopped = Run(tmp_path / "run").latest().step
+    assert stopped > 0
+    assert f"stopped at step {stopped:,}" in err

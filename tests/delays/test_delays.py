@@ -1,0 +1,243 @@
+"""Laws draw what they say, are values, can be written as text; and bad ones are refused in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from delayrl.delays import (
+    PAPER_STOCHASTIC_5,
+    Channel,
+    Choice,
+    Constant,
+    Delay,
+    Markov,
+    Recorded,
+    as_delay,
+    gamma,
+    gilbert_elliott,
+    poisson,
+    random_walk,
+    recorded,
+    uniform,
+)
+from delayrl.errors import DelayRLError
+from strategies import DELAYS, LAWS
+
+
+def drawn(law: object, count: int, seed: int = 0) -> list[int]:
+    """One long episode."""
+    random, memory, values = np.random.default_rng(seed), 0, []
+    for _ in range(count):
+        value, memory = law.draw(memory, random)  # type: ignore[attr-defined]
+        values.append(value)
+    return values
+
+
+@given(DELAYS)
+def test_text_round_trip(delay: Delay) -> None:
+    assert as_delay(delay.plain()) == delay
+    assert as_delay(str(delay)) == delay
+    assert len(str(delay.label())) <= max(len(str(delay.plain())), 12)
+
+
+@given(LAWS, st.integers(0, 5), st.integers(0, 100))
+def test_laws_stay_in_their_range_and_shift(law: object, more: int, seed: int) -> None:
+    values = drawn(law, 50, seed)
+    assert all(0 <= value <= law.maximum for value in values)  # type: ignore[attr-defined]
+    assert drawn(law.shifted(more), 50, seed) == [value + more for value in values]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("law", "expected"),
+    [
+        (uniform(2, 4), {2: 1 / 3, 3: 1 / 3, 4: 1 / 3}),
+        (Choice((1, 5), (0.1, 0.9)), {1: 0.1, 5: 0.9}),
+        (PAPER_STOCHASTIC_5.law, {1: 0.02, 2: 0.02, 3: 0.02, 4: 0.02, 5: 0.92}),
+        (gilbert_elliott(1, 6, 0.05, 0.3), {1: 6 / 7, 6: 1 / 7}),  # stationary: recover / (worsen + recover)
+        (random_walk(3), {k: 1 / 4 for k in range(4)}),
+    ],
+)
+def test_frequencies(law: Choice | Markov, expected: dict[int, float]) -> None:
+    """Each law's long-run share of every delay; and from the first draw of an episode on."""
+    counts = np.bincount(drawn(law, 40_000), minlength=7) / 40_000
+    first = np.bincount([law.draw(0, np.random.default_rng(seed))[0] for seed in range(4000)], minlength=7) / 4000
+    for k in range(7):
+        assert counts[k] == pytest.approx(expected.get(k, 0), abs=0.02)
+        assert first[k] == pytest.approx(expected.get(k, 0), abs=0.03)
+
+
+def test_truncated_distributions_against_scipy() -> None:
+    law = poisson(3, 8)
+    pmf = stats.poisson.pmf(np.arange(9), 3)
+    np.testing.assert_allclose(law.probabilities, pmf / pmf.sum(), rtol=1e-12)
+    for mean, deviation, maximum in ((3.0, 1.5, 8), (0.7, 2.0, 6), (20.0, 2.0, 30), (2.5, 0.1, 5)):
+        shape, scale = (mean / deviation) ** 2, deviation**2 / mean
+        mass = np.diff(stats.gamma.cdf(np.arange(maximum + 1), shape, scale=scale), prepend=0)
+        np.testing.assert_allclose(gamma(mean, deviation, maximum).probabilities, mass / mass.sum(), atol=1e-12)
+
+
+def test_bursts() -> None:
+    """In a Gilbert-Elliott network bad delays come in runs of mean 1 / recover; independent draws have none."""
+    values = np.array(drawn(gilbert_elliott(0, 1, 0.05, 0.2), 50_000))
+    starts = ((values[1:] == 1) & (values[:-1] == 0)).sum()
+    assert values.sum() / starts == pytest.approx(5, rel=0.1)
+    steps = np.abs(np.diff(drawn(random_walk(9, 0.5), 20_000)))
+    assert set(steps) == {0, 1}
+    assert steps.mean() == pytest.approx(0.5 * 0.9, abs=0.02)  # at the two of ten ends half of the moves stay
+
+
+def test_recorded_goes_on_in_order_from_a_random_place() -> None:
+    trace = tuple(range(7))
+    starts = set()
+    for seed in range(60):
+        values = drawn(Recorded(trace), 10, seed)
+        assert values == [(values[0] + i) % 7 for i in range(10)]
+        starts.add(values[0])
+    assert starts == set(trace)
+
+
+def test_recorded_files(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([3, 1, 4]))
+    (tmp_path / "b.csv").write_text("sent,delay\n0.00,0.010\n0.02,0.041\n0.04,0.040\n")
+    (tmp_path / "c.txt").write_text("3\n1\n4\n")
+    assert recorded(tmp_path / "a.npy") == recorded(tmp_path / "c.txt") == Recorded((3, 1, 4))
+    assert recorded(tmp_path / "b.csv", 0.02, "s") == Recorded((1, 3, 2))  # 41 ms are seen at the third step
+    assert as_delay(f"recorded:{tmp_path / 'b.csv'}:s", 0.02).observation.law == Recorded((1, 3, 2))
+    long = Delay(Channel(Recorded(tuple(range(30)) * 3)))
+    assert as_delay(long.plain()) == long
+    assert len(str(long.label())) < 30
+
+
+@pytest.mark.parametrize(
+    ("text", "step", "maximum"),
+    [("80ms", 0.04, 2), ("0.08s", 0.05, 2), ("81ms", 0.04, 3), ("0.1s", 0.1, 1), ("uniform:20ms:90ms", 0.02, 5)],
+)
+def test_times_are_rounded_up(text: str, step: float, maximum: int) -> None:
+    assert as_delay(text, step).maximum == maximum
+
+
+def test_channels_of_a_text() -> None:
+    delay = as_delay("uniform:1:5@fifo+action=2+reward=uniform:0:3")
+    assert delay == Delay(Channel(uniform(1, 5), "fifo"), Channel(Constant(2)), Channel(uniform(0, 3)))
+    assert delay.maximum == 7
+    assert delay.observed() == Delay(Channel(uniform(3, 7), "fifo"))
+    assert as_delay("paper-stochastic-5").observation == PAPER_STOCHASTIC_5
+    assert str(as_delay("paper-stochastic-5")) == "paper-stochastic-5"
+    assert as_delay("paper-stochastic-5@fifo").observation.rule == "fifo"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("-1", "negative"),
+        ("2.5", "whole"),
+        ("soon", "is no number"),
+        ("nan", "is no number"),
+        ("", "is no number"),
+        ("unifrom:1:5", "unknown delay"),
+        ("uniform:5:1", "LOW ≤ HIGH"),
+        ("uniform:1", "takes 2 numbers"),
+        ("uniform:-1:3", "negative"),
+        ("uniform:0:99999999", "longer than we can hold"),
+        ("choice:1=0.5,2=0.6", "sum to 1.1"),
+        ("choice:1=0.5", "sum to 0.5"),
+        ("choice:1=-1,2=2", "from 0 to 1"),
+        ("choice:1", "is no number"),
+        ("markov:1,2:1,0", "square"),
+        ("gilbert:1:5:2:0.1", "from 0 to 1"),
+        ("walk:3:2", "from 0 to 1"),
+        ("poisson:-1:3", "positive"),
+        ("gamma:100:1:3", "never below"),
+        ("5@soon", "newest, fifo, raw"),
+        ("80ms", "no `dt`"),
+        ("1+2", "is no number"),
+        ("1+observation=2", "two for the observations"),
+        ("2+reward=3@raw", "newest or fifo"),
+        ("recorded:nowhere.csv", "No such file"),
+        ("recorded:a+b@c.csv", "a\\+b@c.csv"),
+        ("recorded", "unknown delay"),
+        ("recorded:" + "9" * 5000 + ",", "No such file|too long"),
+        ("1e400", "is no number|finite|whole"),
+        ("gamma:1e-200:1:5", "between"),
+        ("gamma:1:1e200:5", "between"),
+        ("walk:100000", "1 to 1000 states"),
+        ("walk:8:0.5s", "no unit"),
+        ("choice:1=0.5s,2=0.5", "no unit"),
+    ],
+)
+def test_bad_texts(text: str, words: str) -> None:
+    with pytest.raises(DelayRLError, match=words) as error:
+        as_delay(text)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "empty"),
+        ("delay\n", "empty"),
+        ("3\n-1\n", "not negative"),
+        ("3\nnan\n", "finite"),
+        ("3\ninf\n", "finite"),
+        ("3\n2.5\n", "recorded:.*:ms"),
+        ("3\nmany\n", "must be numbers"),
+    ],
+)
+def test_bad_recordings(content: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "trace.csv").write_text(content)
+    with pytest.raises(DelayRLError, match=words):
+        recorded(tmp_path / "trace.csv")
+
+
+def test_recordings_in_odd_forms(tmp_path: Path) -> None:
+    (tmp_path / "bom.csv").write_bytes("\ufeff3\r\n1\r\n4\r\n".encode())
+    assert recorded(tmp_path / "bom.csv") == Recorded((3, 1, 4))
+    (tmp_path / "quoted.csv").write_text('time,"delay"\n0,"3"\n1,"1"\n\n')
+    assert recorded(tmp_path / "quoted.csv") == Recorded((3, 1))
+    np.save(tmp_path / "table.npy", np.array([[100.0, 3.0], [101.0, 4.0]]))
+    assert recorded(tmp_path / "table.npy") == Recorded((3, 4))
+    (tmp_path / "a+b@c=d.csv").write_text("2\n")
+    assert as_delay(f"recorded:{tmp_path / 'a+b@c=d.csv'}+action=1").maximum == 3
+    np.save(tmp_path / "complex.npy", np.array([1j]))
+    np.savez(tmp_path / "zip.npz", a=np.ones(2))
+    (tmp_path / "zip.npz").rename(tmp_path / "zip.npy")
+    huge = (
+        b"\x93NUMPY\x01\x00v\x00"
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117)
+        + b"\n"
+    )
+    (tmp_path / "huge.npy").write_bytes(huge)
+    for name in ("complex.npy", "zip.npy", "huge.npy"):
+        with pytest.raises(DelayRLError, match="cannot be read"):
+            recorded(tmp_path / name)
+
+
+def test_what_a_newcomer_types() -> None:
+    assert Delay(observation=3, action="2") == as_delay("3+action=2")  # type: ignore[arg-type]
+    assert Channel(3) == Channel(Constant(3))  # type: ignore[arg-type]
+    assert as_delay(" 2 + action = 1 ") == as_delay("2+action=1")
+    with pytest.raises(DelayRLError, match="as_delay"):
+        Channel("uniform:1:3")  # type: ignore[arg-type]
+    assert poisson(1000, 3).probabilities[3] > 0.99
+    assert len(str(as_delay("choice:" + ",".join(f"{i}={1 / 50!r}" for i in range(50))).label())) < 60
+
+
+def test_recordings_are_data(tmp_path: Path) -> None:
+    """A .npy file with pickled objects is refused, and nothing in it runs."""
+    np.save(tmp_path / "trace.npy", np.array([object()]), allow_pickle=True)
+    (tmp_path / "cut.npy").write_bytes(b"\x93NUMPY")
+    for name in ("trace.npy", "cut.npy"):
+        with pytest.raises(DelayRLError, match="cannot be read"):
+            recorded(tmp_path / name)
+
+
+def test_what_is_no_delay() -> None:
+    for given_ in (True, None, [1], 2.5):
+        with pytest.raises(DelayRLError, match="whole"):
+            as_delay(given_)  # type: ignore[arg-type]
+    with pytest.raises(DelayRLError, match="constant delay"):
+        as_delay("action=uniform:0:3").observed()

@@ -1,0 +1,597 @@
+"""Known delays are found again: of environments to the step, of logs to the row."""
+
+import csv
+import json
+import subprocess
+import sys
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+from gymnasium.wrappers import DelayObservation, StickyAction
+
+from delayrl import DelayRLError
+from delayrl.cli.main import main
+from delayrl.cli.measure import seconds
+from delayrl.envs import quiet
+from delayrl.measure import from_log, probe
+from delayrl.measure.log import whole_steps
+from delayrl.wrappers import AugmentedObservation, Delayed
+
+ROOT = Path(__file__).parents[2]
+
+
+def make(name: str) -> gym.Env:
+    with quiet():
+        return gym.make(name, disable_env_checker=True)
+
+
+class ActionDelay(gym.Wrapper):
+    def __init__(self, env: gym.Env, steps: int) -> None:
+        super().__init__(env)
+        self.steps = steps
+
+    def reset(self, **words):
+        self.queue = deque([np.zeros(self.action_space.shape, np.float32)] * self.steps)
+        return self.env.reset(**words)
+
+    def step(self, action):
+        self.queue.append(action)
+        return self.env.step(self.queue.popleft())
+
+
+class RandomDelay(gym.Wrapper):
+    """Observations travel for a random time; raw: step t shows s_{t-d}; else the newest that has arrived."""
+
+    def __init__(self, env: gym.Env, low: int, high: int, raw: bool) -> None:
+        super().__init__(env)
+        self.low, self.high, self.raw = low, high, raw
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.draws = np.random.default_rng([seed, 7])
+        self.history, self.arrivals = [obs], [0]
+        return obs, info
+
+    def step(self, action):
+        obs, *rest = self.env.step(action)
+        t, travel = len(self.history), int(self.draws.integers(self.low, self.high + 1))
+        self.history.append(obs)
+        self.arrivals.append(t + travel)
+        shown = max(0, t - travel) if self.raw else max(i for i, a in enumerate(self.arrivals) if a <= t)
+        self.shown = shown
+        return self.history[shown], *rest
+
+
+class RandomActionDelay(gym.Wrapper):
+    """Each action travels 0 or 2 steps; of those that have arrived the newest acts on."""
+
+    def reset(self, *, seed=None, options=None):
+        self.draws, self.t, self.sent = np.random.default_rng([seed, 7]), 0, []
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        self.sent.append((self.t + 2 * int(self.draws.integers(2)), action))
+        arrived = [a for arrival, a in self.sent if arrival <= self.t]
+        self.t += 1
+        return self.env.step(arrived[-1] if arrived else np.zeros_like(action))
+
+
+class DoublePush(gym.Wrapper):
+    """A buffer for a delay of `steps` into which a bug puts every observation twice."""
+
+    def __init__(self, env: gym.Env, steps: int) -> None:
+        super().__init__(env)
+        self.steps = steps
+
+    def reset(self, **words):
+        obs, info = self.env.reset(**words)
+        self.buffer = deque([obs] * (self.steps + 1), maxlen=self.steps + 1)
+        return obs, info
+
+    def step(self, action):
+        obs, *rest = self.env.step(action)
+        self.buffer.extend([obs, obs])
+        return self.buffer[0], *rest
+
+
+class Hold(gym.Wrapper):
+    """A sensor that is read every third step."""
+
+    def reset(self, **words):
+        self.t = 0
+        self.obs, info = self.env.reset(**words)
+        return self.obs, info
+
+    def step(self, action):
+        obs, *rest = self.env.step(action)
+        self.t += 1
+        self.obs = obs if self.t % 3 == 0 else self.obs
+        return self.obs, *rest
+
+
+class Repeat(gym.Wrapper):
+    def step(self, action):
+        for _ in range(3):
+            result = self.env.step(action)
+        return result
+
+
+class Hidden(gym.Env):
+    """x' = x/2 + a, shown in the same array each time; no attribute says what the state is."""
+
+    observation_space, action_space = Box(-9, 9, (1,), np.float32), Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, rewarded: bool = True, noise: bool = False) -> None:
+        self.rewarded, self.noise = rewarded, noise
+        self.array = np.zeros(1, np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.array[:] = self.np_random.uniform(-1, 1)
+        return self.array, {}
+
+    def step(self, action):
+        self.array[:] = self.array / 2 + action + (np.random.default_rng().normal() if self.noise else 0)
+        return self.array, float(self.array[0]) if self.rewarded else 0.0, False, False, {}
+
+
+def delays(env: gym.Env | str, **words) -> tuple:
+    p = probe(env, episodes=3, **words)
+    assert sum(p.total.values()) >= 10
+    assert set(p.reaction) <= set(range(max(p.total) + 1))
+    return tuple(None if c is None else sorted(c) for c in (p.action, p.observation, p.total))
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "InvertedPendulum-v5", "delayrl/Walk-v0"])
+@pytest.mark.parametrize(("late", "slow"), [(0, 0), (5, 0), (0, 3), (4, 2)])
+def test_constant_delays(name: str, late: int, slow: int) -> None:
+    """0: the observation that step(a) returns reacts to a. Delays add up, in either order of the wrappers."""
+    want = ([slow], [late], [late + slow])
+    assert delays(Delayed(ActionDelay(make(name), slow), late)) == want
+    assert delays(ActionDelay(Delayed(make(name), late), slow)) == want
+    assert delays(DelayObservation(ActionDelay(make(name), slow), late))[2] == want[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "want"), [("2+action=3", ([3], [2], [5])), ("1@fifo+action=1+reward=2", ([1], [1], [2]))]
+)
+def test_channels_of_the_wrapper(text: str, want: tuple) -> None:
+    assert delays(Delayed(make("Pendulum-v1"), text)) == want
+
+
+@pytest.mark.parametrize("text", ["uniform:1:3", "uniform:1:4@raw", "gilbert:0:4:0.2:0.4@fifo", "paper-stochastic-5"])
+def test_laws_and_rules_of_the_wrapper(text: str) -> None:
+    """The ages that are found are those that the wrapper shows."""
+    env = Delayed(make("Pendulum-v1"), text)
+    found = probe(env, episodes=4)
+    assert set(found.action) == {0}
+    assert 1 < len(found.observation) <= env.history + 1
+    assert max(found.observation) == env.history
+
+
+def test_bare_tasks_by_name() -> None:
+    assert delays(Delayed(ActionDelay(make("HalfCheetah-v5"), 2), 1)) == ([2], [1], [3])
+    for name in ("Reacher-v5", "delayrl/Pusher-v4", "MountainCarContinuous-v0"):
+        assert delays(name) == ([0], [0], [0])
+
+
+def test_double_push_halves_the_delay() -> None:
+    assert delays(DoublePush(make("Pendulum-v1"), 6)) == ([0], [3], [3])
+
+
+def test_long_delay_and_short_episodes() -> None:
+    """Of the pushes of full size many end Hopper's episode before they are seen; Reacher ends at 50 steps."""
+    assert sorted(probe(Delayed(make("Hopper-v5"), 20), episodes=1).total) == [20]
+    p = probe(Delayed(make("InvertedPendulum-v5"), 9), episodes=2)
+    assert (sorted(p.total), p.scale < 1) == ([9], True)
+    assert sorted(probe(Delayed(make("Reacher-v5"), 40), episodes=1).total) == [40]
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_random_delays_step_by_step(raw: bool) -> None:
+    """The distribution is that of the ages that the wrapper showed, count by count, in the same steps."""
+    env = RandomDelay(make("Pendulum-v1"), 1, 5, raw)
+    p = probe(env, episodes=4, seed=3)
+    ages: Counter[int] = Counter()
+    for seed in range(3, 7):
+        env.reset(seed=seed)
+        for t in range(1, p.length + 1):
+            env.step(np.zeros(1, np.float32))
+            ages[t - env.shown] += t > max(p.total)
+    assert p.total == p.observation == {age: count for age, count in sorted(ages.items()) if count}
+    assert p.action == {0: sum(p.action.values())}
+    assert len(p.total) == 5
+    assert set(p.reaction) <= set(p.total)
+
+
+def test_random_action_delay_and_lost_actions() -> None:
+    p = probe(RandomActionDelay(make("Pendulum-v1")), episodes=4)
+    assert sorted(p.action) == [0, 2]
+    assert sorted(p.observation) == [0]
+    assert p.lost > 0.1  # overtaken by a later action
+    p = probe(StickyAction(make("Pendulum-v1"), 0.5), episodes=8)
+    assert sorted(p.action) == [0]
+    assert 0.3 < p.lost < 0.7
+    assert 0.3 < p.total[0] / sum(p.total.values()) < 0.7  # the rest shows an older action's effect
+
+
+def test_held_observations_and_repeated_actions() -> None:
+    p = probe(Hold(make("Pendulum-v1")), episodes=3)
+    assert sorted(p.total) == [0, 1, 2]
+    assert max(p.total.values()) - min(p.total.values()) <= 6
+    assert delays(Delayed(Repeat(make("Pendulum-v1")), 2)) == ([0], [2], [2])
+    assert delays(Repeat(Delayed(make("Pendulum-v1"), 5))) == (
+        [0],
+        [1],
+        [1],
+    )  # 5 of 3 inner steps: 6 show it
+
+
+def test_actions_in_the_observation_are_no_observation_of_them() -> None:
+    p = probe(AugmentedObservation(Delayed(make("Pendulum-v1"), 4)), episodes=2)
+    assert sorted(p.total) == [4]
+    assert p.echoes == (3, 4, 5, 6)
+    assert p.components == (4, 4, 4, None, None, None, None, None)
+
+
+def test_without_a_visible_state_rewards_tell() -> None:
+    class Plain(gym.Wrapper):  # truth would be in Delayed's info
+        def step(self, action):
+            *result, _ = self.env.step(action)
+            return *result, {}
+
+        def reset(self, **words):
+            return self.env.reset(**words)[0], {}
+
+    p = probe(Plain(Delayed(ActionDelay(Hidden(), 2), 3)), episodes=2)
+    assert (sorted(p.action), sorted(p.observation), sorted(p.total)) == ([2], [3], [5])
+    assert "reward" in p.action_from
+    p = probe(Plain(Delayed(ActionDelay(Hidden(rewarded=False), 2), 3)), episodes=2)
+    assert (p.action, p.observation, sorted(p.total)) == (None, None, [5])
+    assert delays(Delayed(Hidden(), 3))[1] == [3]  # from info["truth"]
+
+
+def test_needs_only_numpy_and_gymnasium() -> None:
+    heavy = {"jax", "matplotlib", "mujoco", "pyarrow"}
+    code = f"import sys, delayrl.measure; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_environments_that_cannot_be_probed() -> None:
+    with pytest.raises(DelayRLError, match=r"does not repeat itself.*np_random"):
+        probe(Hidden(noise=True))
+    with pytest.raises(DelayRLError, match="no observation reacted"):
+        probe("delayrl/Coin-v0")
+    with pytest.raises(DelayRLError, match=r"no observation reacted.*within 6 steps"):
+        probe(Delayed(make("Pendulum-v1"), 20), longest=6)
+    with pytest.raises(DelayRLError, match="Box actions"):
+        probe(make("CartPole-v1"))
+    with pytest.raises(DelayRLError, match="must return a Gymnasium environment; got int"):
+        probe(lambda: 3)
+    with pytest.raises(DelayRLError, match="failed: ZeroDivisionError"):
+        probe(lambda: 1 / 0)
+
+
+# ------------------------------------------------------------------------------------------------ logs
+
+ROW = 0.02
+STEPS: dict[str, Callable[[float, float, float], tuple[float, float]]] = {
+    "gain": lambda x, v, u: (u, 0.0),
+    "integrator": lambda x, v, u: (x + 0.1 * u, 0.0),
+    "servo": lambda x, v, u: (x + (w := v + 0.09 * (u - x) - 0.42 * v), w),
+    "second": lambda x, v, u: (x + (w := v + 0.02 * u - 0.05 * v - 0.01 * x), w),
+}
+
+
+def signals(plant: str, delay, rows: int = 1500, noise: float = 0.0, policy: bool = True, wander: float = 0.8) -> tuple:
+    """Commands and late observations; `delay` in rows, or a function of the row."""
+    rng = np.random.default_rng(0)
+    states, u, y, x, v, memory = [0.0], np.zeros(rows), np.zeros(rows), 0.0, 0.0, 0.0
+    for t in range(rows):
+        late = delay(t) if callable(delay) else delay
+        y[t] = states[max(0, t - late)] + noise * rng.normal()
+        memory = wander * memory + 0.3 * rng.normal()
+        u[t] = np.tanh(memory - 0.5 * y[t]) if policy else memory
+        x, v = STEPS[plant](x, v, u[t])
+        states.append(x)
+    return u, y
+
+
+def write(path: Path, columns: dict, rows: list[int] | None = None) -> Path:
+    with path.open("w", newline="") as file:
+        table = list(zip(*columns.values(), strict=True))
+        csv.writer(file).writerows([list(columns), *(table if rows is None else [table[i] for i in rows])])
+    return path
+
+
+def log(path: Path, u: np.ndarray, y: np.ndarray, time: np.ndarray | None = None) -> Path:
+    return write(path, {"time": ROW * np.arange(len(u)) if time is None else time, "command": u, "obs": y})
+
+
+def test_held_commands(tmp_path: Path) -> None:
+    """A command that is held for as long as the delay: one step's response falls on the next step's command."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1, 1, 200), 10)
+    for delay in (3, 9, 10, 11):
+        x, v, y = 0.0, 0.0, []
+        for t in range(len(u)):
+            y.append(x)
+            x, v = STEPS["servo"](x, v, u[t - delay] if t >= delay else 0.0)
+        e = from_log(log(tmp_path / "log.csv", u, np.array(y) + 0.002 * rng.normal(size=len(u))))
+        assert e.delay == pytest.approx(delay * ROW), delay
+
+
+@pytest.mark.parametrize("policy", [True, False])
+@pytest.mark.parametrize("plant", list(STEPS))
+def test_dead_time_of_plants(plant: str, policy: bool, tmp_path: Path) -> None:
+    """To the row, whatever the plant's own lag, with and without feedback, up to noise of a few percent."""
+    for delay, noise in ((0, 0.0), (4, 0.0), (9, 0.005)):
+        e = from_log(log(tmp_path / "log.csv", *signals(plant, delay, noise=noise, policy=policy)))
+        assert e.delay == pytest.approx(delay * ROW)
+        assert e.low <= delay * ROW <= e.high
+        assert (e.train_with, e.step) == (str(delay), delay)
+        assert e.strength > 1
+
+
+def test_the_peak_is_no_delay(tmp_path: Path) -> None:
+    """Why it is not the peak that is reported: the plant's own lag is in it, here more than twice the delay."""
+    e = from_log(log(tmp_path / "log.csv", *signals("second", 4, policy=False, wander=0.99)))
+    assert e.delay == pytest.approx(4 * ROW)
+    assert e.peak.lag > 10 * ROW
+    e = from_log(log(tmp_path / "log.csv", *signals("gain", 4, policy=False)))
+    assert e.peak.lag == pytest.approx(5 * ROW, abs=0.2 * ROW)  # no lag of its own: the delay, and the row of the step
+
+
+def test_unrelated_signals_show_nothing(tmp_path: Path) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        u, y = np.cumsum(rng.normal(size=(2, 600)), 1) if seed % 2 else rng.normal(size=(2, 600))
+        with pytest.raises(DelayRLError, match="no delay found"):
+            from_log(log(tmp_path / "log.csv", u, y))
+
+
+def test_feedback_alone_is_no_delay(tmp_path: Path) -> None:
+    """A policy that only reads the observation, of a process that it cannot move."""
+    rng = np.random.default_rng(0)
+    y = np.cumsum(rng.normal(size=1000))
+    with pytest.raises(DelayRLError, match="no delay found"):
+        from_log(log(tmp_path / "log.csv", -0.5 * y + rng.normal(size=1000), y))
+
+
+def test_irregular_rows(tmp_path: Path) -> None:
+    """Jitter of the stamps, lost rows, a long gap; the delay is in seconds, so half the rows give half the rows."""
+    rng = np.random.default_rng(0)
+    u, y = signals("servo", 6, 3000, policy=False)
+    time = ROW * np.arange(3000) + rng.uniform(-0.3, 0.3, 3000) * ROW
+    assert from_log(log(tmp_path / "log.csv", u, y, time)).delay == pytest.approx(6 * ROW, abs=1.01 * ROW)
+    time[2000:] += 3600
+    assert from_log(log(tmp_path / "log.csv", u, y, time)).delay == pytest.approx(6 * ROW, abs=1.01 * ROW)
+    kept = sorted(rng.choice(3000, 2850, replace=False))
+    e = from_log(write(tmp_path / "log.csv", {"time": time, "command": u, "obs": y}, kept))
+    assert e.delay == pytest.approx(6 * ROW, abs=1.01 * ROW)
+    assert e.rows < 3000
+
+
+def test_columns_units_and_recordings(tmp_path: Path) -> None:
+    u, y = signals("servo", 3, 1200)
+    clock = np.tile(1000 * ROW * np.arange(400), 3)  # three recordings, in ms
+    path = write(
+        tmp_path / "log.csv", {"clock": clock, "part": np.repeat(range(3), 400), "wish": u, "angle": y, "x": y}
+    )
+    words = {"time": "clock", "commands": ["wish"], "observations": ["angle"]}
+    e = from_log(path, episode="part", unit="ms", **words)
+    assert (e.row, e.delay) == (pytest.approx(ROW), pytest.approx(3 * ROW))
+    assert (e.peak.command, e.peak.observation) == ("wish", "angle")
+    with pytest.raises(DelayRLError, match="row 401: clock goes back"):
+        from_log(path, unit="ms", **words)
+
+
+def test_a_delay_that_drifts_and_a_cold_start(tmp_path: Path) -> None:
+    e = from_log(log(tmp_path / "log.csv", *signals("servo", lambda t: 3 + 3 * (t > 2100), 4000)))
+    assert [round(d / ROW) for _, d in e.windows] == [3, 3, 3, 3, 6, 6, 6, 6]
+    assert e.train_with == "uniform:3:6"
+    e.save(tmp_path / "steps.txt")
+    assert (tmp_path / "steps.txt").read_text().split() == ["3"] * 4 + ["6"] * 4
+    cold = signals("servo", lambda t: 20 - min(t, 100) // 6, 3000)
+    e = from_log(log(tmp_path / "log.csv", *cold))
+    assert (e.delay, e.train_with) == (pytest.approx(4 * ROW), "4")
+
+
+def test_period_and_rounding(tmp_path: Path) -> None:
+    """Up: an action that is still on its way must be remembered. But not for what a float adds."""
+    path = log(tmp_path / "log.csv", *signals("servo", 7))
+    assert [from_log(path, period).step for period in (0.02, 0.04, 0.07, 0.14, 1.0)] == [7, 4, 2, 1, 1]
+    for steps in range(200):
+        for period in (0.02, 0.001, 1 / 30, 7.3):
+            assert whole_steps(steps * period, period) == steps
+            assert whole_steps((steps + 0.01) * period, period) == steps + 1
+    times = {"20ms": 0.02, "0.02": 0.02, "50Hz": 0.02, "2e-2s": 0.02, "15 s": 15.0, "500us": 5e-4}
+    assert {text: seconds("period", text) for text in times} == pytest.approx(times)
+
+
+def test_stamps_are_exact(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    made = 1.7e9 + ROW * np.arange(1000)
+    steps = np.where(np.arange(1000) < 40, 30, rng.choice([3, 4, 5], 1000))  # a cold start of 40 rows
+    columns = {"stamp": made, "received": made + ROW * steps, "command": 1.0}
+    columns["command"] = np.ones(1000)  # not looked at
+    e = from_log(write(tmp_path / "log.csv", columns))
+    left_out = 1000 - e.rows
+    assert 40 <= left_out <= 60
+    assert e.counts == dict(sorted(Counter(steps[left_out:].tolist()).items()))
+    assert (e.method, e.train_with, e.slowest_warm_up) == ("stamps", "uniform:3:5", pytest.approx(0.6, abs=1e-5))
+    assert from_log(write(tmp_path / "log.csv", columns), warm_up=0).longest == pytest.approx(0.6, abs=1e-5)
+    assert from_log(tmp_path / "log.csv", 0.1).train_with == "1"
+    columns["received"] = made + 0.05 + 1e-3 * (made - made[0])  # a clock that gains 1 ms a second
+    assert from_log(write(tmp_path / "log.csv", columns)).drift == pytest.approx(1000, rel=0.01)
+
+
+def test_simulated_robot(tmp_path: Path) -> None:
+    """HalfCheetah, observations four steps late, a random feedback policy: what was set comes out."""
+    env = Delayed(make("HalfCheetah-v5"), 4)
+    rng = np.random.default_rng(0)
+    gains, memory, rows = 0.1 * rng.normal(size=(6, 17)), np.zeros(6), []
+    obs, _ = env.reset(seed=0)
+    for t in range(1000):
+        memory = 0.8 * memory + 0.3 * rng.normal(size=6)
+        action = np.tanh(gains @ obs + memory).astype(np.float32)
+        rows.append([t * env.unwrapped.dt, *action, *obs])
+        obs, *_ = env.step(action)
+    names = ["time", *(f"action_{i}" for i in range(6)), *(f"observation_{i}" for i in range(17))]
+    e = from_log(write(tmp_path / "log.csv", dict(zip(names, np.array(rows).T, strict=True))))
+    assert (e.train_with, e.delay) == ("4", pytest.approx(4 * 0.05))
+    assert sorted(probe(env, episodes=1).total) == [4]
+
+
+def test_parquet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Columns of numbers and of vectors; and one line where pyarrow is missing."""
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    u, y = signals("servo", 5)
+    path = tmp_path / "log.parquet"
+    vectors = {"action": [[a, 0.0] for a in u], "observation.state": [[b, 1.0] for b in y]}
+    parquet.write_table(pyarrow.table({"timestamp": ROW * np.arange(len(u)), **vectors}), path)
+    e = from_log(path)
+    assert (e.train_with, e.peak.command, e.peak.observation) == ("5", "action[0]", "observation.state[0]")
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(DelayRLError, match="damaged"):
+        from_log(path)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(DelayRLError, match=r"delayrl\[parquet\]"):
+        from_log(path)
+
+
+# ---------------------------------------------------------------------------------------- command line
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(["measure", *map(str, arguments)])
+    captured = capsys.readouterr()
+    assert (end.value.code, captured.out, captured.err.count("\n")) == (2, "", 1), captured.err
+    assert captured.err.startswith("delayrl: ")
+    return captured.err
+
+
+def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, saved = log(tmp_path / "log.csv", *signals("servo", 4)), tmp_path / "steps.txt"
+    main(["measure", str(path), "--period", "20ms", "--plot", str(tmp_path / "a.png"), "--save", str(saved)])
+    out = capsys.readouterr().out
+    for words in ("dead time                 80 ms", "train with: --delay 4", f"--delay recorded:{saved}"):
+        assert words in out
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    assert set(saved.read_text().split()) == {"4"}
+    main(["measure", str(path), "--period", "40ms", "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert (result["kind"], result["train_with"], result["step"]) == ("log", "2", 2)
+    assert result["low"] <= result["delay"] <= result["high"]
+
+
+def test_command_for_environments(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    module = "import gymnasium\nfrom delayrl.wrappers import Delayed\n\n\ndef make_env():\n"
+    module += "    return Delayed(gymnasium.make('Pendulum-v1'), 2)\n"
+    (tmp_path / "my_own_task.py").write_text(module)
+    monkeypatch.chdir(tmp_path)
+    main(["measure", "my_own_task:make_env", "--episodes", "2"])
+    out = capsys.readouterr().out
+    for words in (
+        "observation delay  2 steps",
+        "action delay       0 steps",
+        "remember 2 actions",
+        "env.unwrapped.state",
+    ):
+        assert words in out
+    main(["measure", "my_own_task:make_env", "--json", "--episodes", "2"])
+    result = json.loads(capsys.readouterr().out)
+    assert (result["kind"], result["total"], result["maximum"]) == ("environment", {"2": 64}, 2)
+    (tmp_path / "my_broken_task.py").write_text("def make_env(:\n")
+    for target, words in (
+        ("my_own_task:nothing", "has no function 'nothing'"),
+        ("nowhere_at_all:make", "cannot import"),
+        ("my_broken_task:make_env", "cannot import"),
+        ("Pendulm-v1", "did you mean Pendulum-v1"),
+    ):
+        assert words in refused(capsys, target)
+    assert "--period is an option of a log" in refused(capsys, "Pendulum-v1", "--period", "20ms")
+    assert "count from 1" in refused(capsys, "Pendulum-v1", "--episodes", "0")
+    assert "counts steps" in refused(capsys, "Pendulum-v1", "--longest", "1s")
+
+
+TIME, COMMAND, OBS = ROW * np.arange(400), *signals("servo", 4, 400)
+
+
+def replaced(values: np.ndarray, row: int, by: object) -> list:
+    return [*values[: row - 1], by, *values[row:]]
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"time": TIME[::-1], "command": COMMAND, "obs": OBS}, "row 2: time goes back"),
+        ({"time": replaced(TIME, 7, TIME[5]), "command": COMMAND, "obs": OBS}, "row 7: time repeats"),
+        ({"time": TIME, "command": replaced(COMMAND, 9, "nan"), "obs": OBS}, "row 9: column command has nan"),
+        ({"time": TIME, "command": replaced(COMMAND, 9, "inf"), "obs": OBS}, "row 9: column command has inf"),
+        ({"time": TIME, "command": COMMAND, "obs": replaced(OBS, 3, "left")}, "row 3: column obs has 'left'"),
+        ({"time": TIME, "command": COMMAND, "obs": replaced(OBS, 3, "")}, "row 3: column obs has an empty cell"),
+        ({"time": TIME[:90], "command": COMMAND[:90], "obs": OBS[:90]}, "too short"),
+        ({"time": TIME[:1], "command": COMMAND[:1], "obs": OBS[:1]}, "too short"),
+        ({"time": TIME[:0], "command": COMMAND[:0], "obs": OBS[:0]}, "has no rows"),
+        ({"time": TIME, "command": TIME * 0, "obs": OBS}, "every command is constant"),
+        ({"time": TIME, "command": COMMAND, "obs": TIME * 0 + 3}, "every observation is constant"),
+        ({"when": TIME, "command": COMMAND, "obs": OBS}, "no column time"),
+        ({"time": TIME, "torque": COMMAND, "obs": OBS}, "--commands"),
+        ({"time": TIME, "command": COMMAND, "angle": OBS}, "--observations"),
+        ({"stamp": TIME, "received": TIME - 0.1}, "the clocks differ"),
+        ({"stamp": TIME[::-1], "received": TIME[::-1] + 0.1}, "the stamp goes back"),
+        ({"stamp": TIME[:5], "received": TIME[:5]}, "too short"),
+    ],
+)
+def test_bad_logs(columns: dict, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert words in refused(capsys, write(tmp_path / "log.csv", columns))
+
+
+def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, content, words in (
+        ("empty.csv", b"", "is empty"),
+        ("binary.csv", bytes(range(256)), "neither CSV text nor a Parquet file"),
+        ("numbers.csv", b"1,2,3\n4,5,6\n", "no header"),
+        ("text.txt", b"hello\nworld\n", "no header"),
+        ("ragged.csv", b"time,command,obs\n0,1,2\n1,2\n", "row 2: 2 cells under 3"),
+        ("twice.csv", b"time,obs,obs\n0,1,2\n", "two columns of the same name"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        assert words in refused(capsys, tmp_path / name)
+    assert "no such file" in refused(capsys, tmp_path / "missing.csv")
+    path = log(tmp_path / "log.csv", *signals("servo", 4, 400))
+    for option, words in (
+        ("--period 20kg", "a time such as 20ms"),
+        ("--period 0", "a time in seconds"),
+        ("--longest 1min", "a time such as"),
+        ("--longest 10s", "too few to look for a delay"),
+        ("--warm-up 7s", "too short"),
+        ("--time clock", "no column clock"),
+        ("--stamp sent", "no column sent"),
+        ("--episodes 3", "an option of an environment"),
+        (f"--plot {tmp_path / 'x.tape'}", ".png"),
+        (f"--save {tmp_path / 'no' / 'x.txt'}", "No such file"),
+    ):
+        assert words in refused(capsys, path, *option.split())
+
+
+def test_example_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """65 ms late, of a servo with a lag of its own, after a cold start; 50 ms and more, stamped."""
+    for name, options in (("arm.csv", []), ("stamps.csv", ["--stamps"])):
+        script = [sys.executable, str(ROOT / "examples" / "make_log.py"), str(tmp_path / name), *options]
+        subprocess.run(script, check=True)
+    e = from_log(tmp_path / "arm.csv", 0.02)
+    assert e.low <= 0.065 <= e.high
+    assert e.train_with == "4"
+    assert from_log(tmp_path / "stamps.csv", 0.02).low > 0.05

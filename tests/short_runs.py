@@ -1,0 +1,40 @@
+"""Runs of a few hundred steps with tiny networks."""
+
+from pathlib import Path
+
+import numpy as np
+
+import delayrl
+from delayrl.run.folder import Run
+
+TINY = {
+    "steps": 300,
+    "random_steps": 100,
+    "replay_capacity": 250,
+    "evaluate_every": 100,
+    "evaluation_episodes": 2,
+    "hidden": [8, 8],
+    "batch_size": 8,
+}
+OWN = {
+    "vdpo": {"width": 8, "layers": 1, "clone_every": 50, "clone_updates": 5},
+    "dida": {"expert_steps": 200, "round_steps": 20, "imitation_updates": 5, "student_hidden": [8]},
+    "lifting": {"lifting_hold": 120, "lifting_end": 250},
+}
+
+
+def train(agent: str, out: Path, **values):
+    tiny = TINY | OWN.get(agent, {}) if agent != "random" else {name: TINY[name] for name in list(TINY)[:5]}
+    options = {
+        "env": "Reacher-v5",
+        "delay": 0 if agent == "sac" else 3,
+        "progress": False,
+        "out": out,
+        "preset": "small",
+    }
+    options |= tiny | values
+    return delayrl.train(agent, **options)
+
+
+def arrays(run: Run) -> dict[str, np.ndarray]:
+    return run.latest().arrays("agent")

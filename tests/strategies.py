@@ -1,0 +1,42 @@
+"""Random delay laws, channels and delays, for hypothesis."""
+
+import numpy as np
+from hypothesis import strategies as st
+
+from delayrl.delays import (
+    Channel,
+    Choice,
+    Constant,
+    Delay,
+    Recorded,
+    gamma,
+    gilbert_elliott,
+    poisson,
+    random_walk,
+    uniform,
+)
+
+STEPS = st.integers(0, 6)
+CHANCE = st.floats(0.01, 0.99)
+
+
+@st.composite
+def choices(draw: st.DrawFn) -> Choice:
+    steps = draw(st.lists(STEPS, min_size=1, max_size=4, unique=True))
+    weights = np.array(draw(st.lists(st.integers(1, 9), min_size=len(steps), max_size=len(steps))))
+    return Choice(tuple(steps), tuple((weights / weights.sum()).tolist()))
+
+
+LAWS = st.one_of(
+    STEPS.map(Constant),
+    choices(),
+    st.tuples(STEPS, STEPS).map(lambda pair: uniform(min(pair), max(pair))),
+    st.builds(poisson, st.floats(0.2, 5), STEPS),
+    st.builds(gamma, st.floats(0.5, 4), st.floats(0.2, 3), st.integers(2, 6)),
+    st.builds(gilbert_elliott, STEPS, STEPS, CHANCE, CHANCE),
+    st.builds(random_walk, STEPS, CHANCE),
+    st.lists(STEPS, min_size=1, max_size=60).map(lambda steps: Recorded(tuple(steps))),
+)
+CHANNELS = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "raw"]))
+ORDERED = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo"]))
+DELAYS = st.builds(Delay, CHANNELS, st.one_of(st.just(Channel()), CHANNELS), st.one_of(st.just(Channel()), ORDERED))

@@ -1,0 +1,88 @@
+"""Large updates keep their memory, and nothing else changes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from delayrl import train
+from delayrl.agents.registry import AGENTS
+from delayrl.core.types import Spec
+from delayrl.training.buffers import LARGE, keep_memory, product_bytes
+
+FAULTS = """
+import resource, sys
+import delayrl.training.buffers
+from delayrl.agents.registry import AGENTS
+from delayrl.core.types import Spec
+if sys.argv[1] == "kept":
+    delayrl.training.buffers.keep_memory(AGENTS["vdpo"].presets["paper"].agent, Spec(17, 6, 5), 1)
+import jax, jax.numpy as jnp
+large = jax.jit(lambda x: jnp.sort(jnp.outer(x, x), 0).sum(0))
+x = jnp.ones(3500)  # 49 MB in between
+faults = []
+for _ in range(9):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    large(x).block_until_ready()
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+print(sorted(faults)[4])  # the heap grows now and then
+"""
+
+
+def glibc() -> bool:
+    """One that can be asked."""
+    name, _, version = ((os.confstr("CS_GNU_LIBC_VERSION") or "") if sys.platform == "linux" else "").partition(" ")
+    return name == "glibc" and tuple(map(int, version.split("."))) >= (2, 35)
+
+
+def huge_pages() -> bool:
+    setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    return setting.exists() and "[always]" in setting.read_text()
+
+
+def python(code: str, *args: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_what_is_large() -> None:
+    paper, small = (AGENTS["vdpo"].presets[name].agent for name in ("paper", "small"))
+    assert max(product_bytes(paper, Spec(17, 6, 5))) > LARGE
+    assert max(product_bytes(small, Spec(17, 6, 5))) < LARGE / 2
+    assert max(product_bytes(AGENTS["sac"].presets["paper"].agent, Spec(17, 6, 0))) < LARGE / 2
+    assert not keep_memory(AGENTS["random"].presets["small"].agent, Spec(17, 6, 0), 8)  # it learns nothing
+
+
+@pytest.mark.skipif(not glibc() or huge_pages(), reason="of glibc 2.35 and newer, with pages of 4 KB")
+def test_no_fresh_pages() -> None:
+    assert int(python(FAULTS, "plain")) > 5_000
+    assert int(python(FAULTS, "kept")) < 500
+
+
+def test_no_result_changes(tmp_path: Path) -> None:
+    words = {"steps": 60, "evaluate_every": 30, "random_steps": 20, "evaluation_episodes": 1, "progress": False}
+    code = """
+import json, sys
+import delayrl.training.buffers, delayrl.training.train
+from jax._src import xla_bridge
+delayrl.training.buffers.LARGE = 0
+keep = delayrl.training.train.keep_memory
+def first(*args):
+    assert not xla_bridge.backends_are_initialized()  # else JAX does not read the setting
+    return keep(*args)
+delayrl.training.train.keep_memory = first
+from delayrl import train
+train("sac", "Pendulum-v1", preset="small", out=sys.argv[1], **json.loads(sys.argv[2]))
+import jax
+print(jax.config.read("jax_cpu_enable_async_dispatch"))
+"""
+    assert python(code, str(tmp_path / "kept"), json.dumps(words)) == str(not glibc())
+    train("sac", "Pendulum-v1", preset="small", out=tmp_path / "plain", **words)
+    for pattern in ("rows.jsonl", "checkpoints/*/agent.safetensors"):
+        found = (sorted((tmp_path / name).glob(pattern)) for name in ("kept", "plain"))
+        one, other = ([file.read_bytes() for file in files] for files in found)
+        assert one == other != []

@@ -1,0 +1,358 @@
+"""What the wrapper shows equals a brute-force account of every message, for every law, rule and channel."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import DelayObservation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_delays import DELAYS
+
+import delayrl
+from delayrl.delays import Delay, as_delay
+from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
+
+
+class Journal(gym.Env):
+    """Observation [t, the action that acted]; the reward of step t is 2**t, so that any sum tells its parts."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+    spec = None
+
+    def __init__(self, length: int, truncates: bool = False):
+        self.length, self.truncates, self.acted = length, truncates, []
+
+    def reset(self, *, seed: int | None = None, options: Any = None):
+        super().reset(seed=seed)
+        self.acted = []
+        return np.zeros(2), {}
+
+    def step(self, action):
+        self.acted.append(float(action[0]))
+        t = len(self.acted)
+        assert t <= self.length, "an episode that is over is not stepped"
+        end = t == self.length
+        return np.array([t, action[0]]), 2.0 ** (t - 1), end and not self.truncates, end and self.truncates, {}
+
+
+def travel_times(law: Any, memory: list[int], random: np.random.Generator) -> int:
+    value, memory[0] = law.draw(memory[0], random)
+    return value
+
+
+def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[float], seed: int) -> list[dict]:
+    """Every message with its time of arrival, kept for ever; and at each step what of it counts."""
+    random = np.random.default_rng([seed, 1])
+    memories = {name: [0] for name in ("action", "observation", "reward")}
+    sent: dict[str, list[tuple[int, int]]] = {"action": [], "observation": [], "reward": []}  # (made, arrives)
+
+    def send(name: str, made: int) -> int:
+        channel = getattr(delay, name)
+        travel = travel_times(channel.law, memories[name], random)
+        arrives = made + travel
+        if channel.rule == "fifo":
+            arrives = max([arrives, *(a for _, a in sent[name])])
+        sent[name].append((made, arrives))
+        return travel
+
+    def counts(name: str, now: int, travel: int) -> int:
+        if getattr(delay, name).rule == "raw":
+            return max(now - travel, -1)
+        return max([made for made, arrives in sent[name] if arrives <= now], default=-1)
+
+    truth = [np.zeros(2)]
+    if fill == "first":
+        sent["observation"].append((0, 0))
+        shown = 0
+    else:
+        shown = counts("observation", 0, send("observation", 0))
+    rows = [{"shown": shown, "truth": truth[0], "reward": None, "end": (False, False)}]
+    acted_on: list[int] = [0]  # how late the action was that led to each state
+    paid: set[int] = set()
+    end = None
+    for t, _ in enumerate(issued):
+        number = t
+        if delay.action.maximum:
+            number = counts("action", t, send("action", t))
+        late = min(t - number, delay.action.maximum)
+        acted_on.append(late)
+        if end is None:
+            truth.append(np.array([t + 1.0, issued[t - late] if t - late >= 0 else 0.0]))
+        else:
+            truth.append(truth[-1])
+        now = t + 1
+        looked = counts("observation", now, send("observation", now))
+        shown = looked if looked >= 0 or fill == "zeros" else 0
+        over = end is None and now == length
+        if not delay.reward.maximum:
+            reward, finish = 2.0**t, (over and not truncates, over and truncates)
+        else:
+            if end is None:
+                send("reward", now)
+                if over and not truncates:
+                    end = sent["reward"][-1][1]
+            cut = over and truncates
+            finish = (end == now, cut)
+            due = {made for made, arrives in sent["reward"] if arrives <= now or any(finish)} - paid
+            paid |= due
+            reward = sum(2.0 ** (made - 1) for made in due)
+        rows.append({"shown": shown, "truth": truth[-1], "reward": reward, "end": finish})
+        if any(finish):
+            break
+    for t, row in enumerate(rows):
+        row["obs"] = truth[row["shown"]] if row["shown"] >= 0 else np.zeros(2)
+        row["age"] = t - max(row["shown"], 0) + delay.action.maximum
+        first = t - row["age"]
+        row["actions"] = [issued[i] if i >= 0 else 0.0 for i in range(first, t)]
+        row["late"] = acted_on[row["shown"]] if row["shown"] >= 0 else 0
+    return rows
+
+
+@settings(max_examples=400, deadline=None)
+@given(DELAYS, st.sampled_from(["first", "zeros"]), st.integers(1, 25), st.booleans(), st.integers(0, 99))
+def test_equals_the_account(delay: Delay, fill: str, length: int, truncates: bool, seed: int) -> None:
+    """Observations, ages, histories, what acts, rewards and the end; and a second episode after it."""
+    env = Delayed(Journal(length, truncates), delay, fill=fill)
+    issued = np.random.default_rng(seed).uniform(-1, 1, length + 20).astype(np.float32).astype(float).tolist()
+    for _ in range(2):
+        obs, info = env.reset(seed=seed)
+        shown, rewards, ends = [(obs, info)], [None], [(False, False)]
+        for action in issued:
+            obs, reward, terminated, truncated, info = env.step(np.float32([action]))
+            shown.append((obs, info))
+            rewards.append(reward)
+            ends.append((terminated, truncated))
+            if terminated or truncated:
+                break
+        rows = account(delay, fill, length, truncates, issued, seed)
+        assert len(rows) == len(shown)
+        for t, (row, (obs, info)) in enumerate(zip(rows, shown, strict=True)):
+            np.testing.assert_array_equal(obs, row["obs"])
+            np.testing.assert_array_equal(info["truth"], row["truth"])
+            assert info["age"] == row["age"]
+            assert info["actions"].shape == (delay.maximum, 1)
+            assert info["actions"][: row["age"], 0].tolist() == row["actions"]
+            assert not info["actions"][row["age"] :].any()
+            assert info["mask"].tolist() == [i < row["age"] for i in range(delay.maximum)]
+            if delay.action.maximum:
+                assert info["observation_age"] == row["age"] - delay.action.maximum
+                assert info["applied"] == row["late"]
+            assert rewards[t] == row["reward"]
+            assert ends[t] == row["end"]
+        assert sum(r for r in rewards if r) == 2.0**length - 1  # each reward once, whatever its delay
+
+
+@settings(max_examples=150, deadline=None)
+@given(DELAYS, st.integers(0, 99))
+def test_no_peek_and_no_travel_in_time(delay: Delay, seed: int) -> None:
+    """What is shown is not newer than what had arrived; newest and fifo never go back; the history covers the age."""
+    env = Delayed(Journal(60), Delay(delay.observation, delay.action))
+    obs, info = env.reset(seed=seed)
+    before = 0.0
+    for t in range(1, 60):
+        obs, _, _, _, info = env.step(np.float32([0.5]))
+        assert obs[0] == t - info.get("observation_age", info["age"])
+        assert 0 <= info["age"] <= delay.maximum
+        if delay.observation.rule != "raw":
+            assert obs[0] >= before
+        before = obs[0]
+
+
+@pytest.mark.parametrize("delay", [1, 4])
+def test_zeros_are_gymnasiums_own_wrapper(delay: int) -> None:
+    for task in ("Pendulum-v1", "Hopper-v5"):
+        ours, theirs = Delayed(gym.make(task), delay, fill="zeros"), DelayObservation(gym.make(task), delay)
+        ours.action_space.seed(0)
+        for seed in range(3):
+            np.testing.assert_array_equal(ours.reset(seed=seed)[0], theirs.reset(seed=seed)[0])
+            done = False
+            while not done:
+                action = ours.action_space.sample()
+                (obs, reward, terminated, truncated, _), other = ours.step(action), theirs.step(action)
+                np.testing.assert_array_equal(obs, other[0])
+                assert (reward, terminated, truncated) == other[1:4]
+                done = terminated or truncated
+
+
+def test_holding_the_first_is_the_released_code() -> None:
+    """VDPO's wrapper repeats s_0 until it is Δ old, and counts min(t, Δ)."""
+    env, bare = Delayed(gym.make("Hopper-v5"), 3), gym.make("Hopper-v5")
+    truth = [bare.reset(seed=1)[0]]
+    shown = [env.reset(seed=1)[0]]
+    env.action_space.seed(0)
+    for _ in range(8):
+        action = env.action_space.sample()
+        truth.append(bare.step(action)[0])
+        obs, *_, info = env.step(action)
+        shown.append(obs)
+        assert info["age"] == min(len(shown) - 1, 3)
+    np.testing.assert_array_equal(shown, [truth[max(t - 3, 0)] for t in range(9)])
+
+
+def test_a_longer_history() -> None:
+    short, long = Delayed(Journal(20), "uniform:1:3"), Delayed(Journal(20), "uniform:1:3", history=6)
+    for env in (short, long):
+        env.reset(seed=3)
+    for _ in range(10):
+        action = short.action_space.sample()
+        a, b = short.step(action)[4], long.step(action)[4]
+        assert a["age"] == b["age"]
+        np.testing.assert_array_equal(np.pad(a["actions"], ((0, 3), (0, 0))), b["actions"])
+    with pytest.raises(delayrl.DelayRLError, match="too short"):
+        Delayed(Journal(20), 5, history=4)
+    with pytest.raises(delayrl.DelayRLError, match="first or zeros"):
+        Delayed(Journal(20), 5, fill="ones")  # type: ignore[arg-type]
+
+
+def vector(mode: str | None, task: str, count: int = 3, **options: Any) -> Any:
+    from gymnasium.vector import SyncVectorEnv
+
+    words = {} if mode is None else {"autoreset_mode": mode}
+    return SyncVectorEnv([lambda: gym.make(task, **options) for _ in range(count)], **words)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize("delay", ["3", "uniform:1:4", "uniform:0:3@fifo+action=uniform:0:2", "paper-stochastic-5"])
+def test_vector_is_many_singles(mode: str, delay: str) -> None:
+    """Number for number, through the ends of episodes, in each of Gymnasium's ways to start the next one."""
+    from gymnasium.vector import AutoresetMode
+
+    env = AugmentedVectorObservation(DelayedVector(vector(AutoresetMode(mode), "Hopper-v5"), delay))
+    singles = [AugmentedObservation(Delayed(gym.make("Hopper-v5"), delay)) for _ in range(3)]
+    obs, infos = env.reset(seed=5)
+    env.action_space.seed(2)
+    now = [single.reset(seed=5 + i) for i, single in enumerate(singles)]
+    ended = np.zeros(3, bool)
+    ends = 0
+    for _ in range(120):
+        for i, (x, info) in enumerate(now):
+            np.testing.assert_array_equal(obs[i], x)
+            for name in ("age", "actions", "mask", "truth"):
+                np.testing.assert_array_equal(infos[name][i], info[name])
+        assert env.observation_space.contains(obs.astype(env.observation_space.dtype))
+        if mode == "Disabled" and ended.any():
+            obs, infos = env.reset(options={"reset_mask": ended})
+            now = [
+                single.reset() if end else now[i] for i, (single, end) in enumerate(zip(singles, ended, strict=True))
+            ]
+            ended = np.zeros(3, bool)
+            continue
+        actions = env.action_space.sample()
+        obs, rewards, terminated, truncated, infos = env.step(actions)
+        for i, single in enumerate(singles):
+            if ended[i] and mode == "NextStep":
+                now[i] = single.reset()
+                assert (rewards[i], terminated[i]) == (0, False)
+                continue
+            x, reward, end, _, info = single.step(actions[i])
+            assert (reward, end) == (rewards[i], terminated[i])
+            if end and mode == "SameStep":
+                np.testing.assert_array_equal(infos["final_obs"][i], x)
+                for name in ("age", "actions", "truth"):
+                    np.testing.assert_array_equal(infos["final_info"][name][i], info[name])
+                x, info = single.reset()
+            now[i] = x, info
+        ended = terminated | truncated
+        ends += ended.sum()
+    assert ends > 5
+
+
+def test_vector_streams_and_refusals() -> None:
+    env = DelayedVector(vector(None, "Pendulum-v1", 4), "uniform:0:5")
+    env.reset(seed=1)
+    ages = np.array([env.step(env.action_space.sample())[4]["age"] for _ in range(40)])
+    assert len({tuple(column) for column in ages.T}) == 4
+    with pytest.raises(delayrl.DelayRLError, match="inside"):
+        DelayedVector(vector(None, "Pendulum-v1"), "2+reward=3")
+    with pytest.raises(delayrl.DelayRLError, match="continuous"):
+        DelayedVector(vector(None, "CartPole-v1"), 2)
+    with pytest.raises(delayrl.DelayRLError, match="goes around"):
+        AugmentedVectorObservation(vector(None, "Pendulum-v1"))  # type: ignore[arg-type]
+
+
+def test_times_in_seconds() -> None:
+    assert delayrl.make("HalfCheetah-v5", "80ms").delay == as_delay(2)  # 50 ms a step
+    assert delayrl.make("Pendulum-v1", "0.1s+action=60ms").delay == as_delay("2+action=2")
+    assert DelayedVector(vector(None, "Pendulum-v1"), "0.1s").delay == as_delay(2)
+    with pytest.raises(delayrl.DelayRLError, match="no `dt`"):
+        delayrl.make("delayrl/Walk-v0", "80ms")
+
+
+def test_augmented_state_of_random_actions() -> None:
+    """It tells which action led to what is seen: without that the delayed task would not be Markov."""
+    env = AugmentedObservation(Delayed(Journal(30), "1+action=uniform:0:2"))
+    env.reset(seed=0)
+    late = set()
+    for _ in range(29):
+        x, *_, info = env.step(env.action_space.sample())
+        assert x.shape == (2 + 3 + 2,)
+        assert env.observation_space.contains(x.astype(env.observation_space.dtype))
+        assert x[-1] == pytest.approx(info["applied"] / 2)
+        late.add(info["applied"])
+    assert late == {0, 1, 2}
+
+
+class Whole(Journal):
+    observation_space = gym.spaces.Box(-100, 100, (2,), np.int64)
+
+
+def test_whole_observations_do_not_cut_actions() -> None:
+    env = AugmentedObservation(Delayed(Whole(20), 2))
+    env.reset(seed=0)
+    for _ in range(3):
+        x, *_ = env.step(np.float32([0.75]))
+    assert x[2:].tolist() == [0.75, 0.75, 1.0]
+
+
+def test_the_time_limit_is_not_late() -> None:
+    """The true end comes at 9, its news would at 15; the time limit of 10 ends the waiting, and pays everything."""
+    gym.register("Journal-v0", lambda: Journal(9), max_episode_steps=10)
+    env = Delayed(gym.make("Journal-v0", disable_env_checker=True), "1+reward=6")
+    gym.registry.pop("Journal-v0")
+    env.reset(seed=0)
+    rewards, ends = [], []
+    for _ in range(10):
+        _, reward, terminated, truncated, _ = env.step(np.float32([0]))
+        rewards.append(reward)
+        ends.append((terminated, truncated))
+    assert ends[-2:] == [(False, False), (True, True)]
+    assert sum(rewards) == 2.0**9 - 1
+
+
+def test_an_episode_is_told_of_once() -> None:
+    """The task's own info of its last step is not repeated until the news arrives."""
+    env = Delayed(gym.wrappers.RecordEpisodeStatistics(Journal(5)), "1+reward=4")
+    env.reset(seed=0)
+    assert sum("episode" in env.step(np.float32([0]))[4] for _ in range(9)) == 1
+
+
+def test_idle_is_zero_in_the_tasks_units() -> None:
+    class Gas(Journal):
+        action_space = gym.spaces.Box(0, 10, (1,))
+
+    gym.register("Gas-v0", lambda: Gas(20), max_episode_steps=30)
+    try:
+        for rescale in (False, True):
+            env = delayrl.make("Gas-v0", "action=2", rescale=rescale)
+            env.reset(seed=0)
+            env.step(np.float32([1]))
+            assert env.unwrapped.acted == [0.0]  # type: ignore[attr-defined]
+    finally:
+        gym.registry.pop("Gas-v0")
+
+
+def test_one_delay_is_enough() -> None:
+    with pytest.raises(delayrl.DelayRLError, match="delayed already"):
+        Delayed(AugmentedObservation(Delayed(Journal(5), 1)), 2)
+    with pytest.raises(delayrl.DelayRLError, match="takes a vector"):
+        DelayedVector(Journal(5), 2)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("delay", [2, "uniform:1:3@fifo+action=1", as_delay("walk:3")])
+def test_made_again_from_its_specification(delay: object) -> None:
+    env = Delayed(gym.make("Pendulum-v1"), delay)  # type: ignore[arg-type]
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.get_wrapper_attr("delay") == env.delay
