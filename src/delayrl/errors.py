@@ -1,9 +1,15 @@
-"""The one exception that the program shows to people, as a single line."""
+"""The exceptions that people see, as a single line."""
 
 
 class DelayRLError(Exception):
-    """Bad input or a broken file: what was given, what is allowed, what to do, in one line."""
+    """Bad input or a broken file: what was given, what is allowed, what to try, in one line."""
 
 
 class StoppedError(DelayRLError):
-    """A run was asked to stop, and has: its newest step is stored, and the same call goes on from there."""
+    """A run stopped when asked to. Its newest step is stored; the same call resumes it."""
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or the name of its type where the message is empty."""
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__

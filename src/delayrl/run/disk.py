@@ -1,0 +1,59 @@
+"""Writing to disk: what is written appears under its name at once and complete, or not at all."""
+
+import contextlib
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from delayrl.errors import DelayRLError
+
+
+@contextlib.contextmanager
+def draft(path: Path) -> Iterator[Path]:
+    """Yield the path of a draft beside `path`; rename it into place when the block ends, delete it if it raises.
+
+    The draft is a file or a folder, as the block makes it. Several processes may draft the same path.
+    """
+    name = path.with_name(f".{path.name}-{os.getpid()}.draft")
+    remove(name)
+    try:
+        yield name
+        name.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            remove(name)
+        raise
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write a file through a draft, flushed to the disk."""
+    with draft(path) as name:
+        write_flushed(name, data)
+
+
+def write_flushed(path: Path, data: bytes) -> None:
+    """Write a file where it stands, flushed to the disk; for what is inside a draft already."""
+    with open(path, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn what the disk refuses into one line."""
+    try:
+        yield
+    except OSError as error:
+        reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
+        raise DelayRLError(f"cannot write to {path}: {reason}; what was stored before is kept") from error

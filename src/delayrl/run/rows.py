@@ -1,0 +1,25 @@
+"""Rows: one for each evaluation episode, as a run folder's rows.jsonl holds them."""
+
+import math
+from typing import Any
+
+from delayrl.errors import DelayRLError
+
+Row = dict[str, Any]
+EPISODE: dict[str, type] = {
+    "step": int,
+    "policy": str,
+    "episode": int,
+    "reset_seed": int,
+    "return": float,
+    "length": int,
+}
+"""The columns that differ between the rows of a run, with their types. The other columns describe its condition."""
+
+
+def check_row(row: Any, where: object) -> Row:
+    """Return a row of a run folder unchanged. Raises DelayRLError, naming `where`, if it is damaged."""
+    typed = isinstance(row, dict) and all(type(row.get(name)) is kind for name, kind in EPISODE.items())
+    if not typed or not math.isfinite(row["return"]):
+        raise DelayRLError(f"{where} holds a damaged row: {str(row)[:200]}")
+    return row
