@@ -11,25 +11,28 @@ from delayrl.errors import DelayRLError
 
 
 @contextlib.contextmanager
-def draft(path: Path) -> Iterator[Path]:
+def draft(path: Path, *, shared: bool = False) -> Iterator[Path]:
     """Yield the path of a draft beside `path`; rename it into place when the block ends, delete it if it raises.
 
-    The draft is a file or a folder, as the block makes it. Several processes may draft the same path.
+    Args:
+        path: what is to be written, a file or a folder (then there must be none of this name yet).
+        shared: whether several processes may write it at the same time. Else a draft that a killed process left
+            behind is overwritten by the next.
     """
-    name = path.with_name(f".{path.name}-{os.getpid()}.draft")
+    name = path.with_name(f".{path.name}-{os.getpid()}.draft" if shared else f".{path.name}.draft")
     remove(name)
     try:
         yield name
-        name.replace(path)
+        name.rename(path)
     except BaseException:
         with contextlib.suppress(OSError):
             remove(name)
         raise
 
 
-def write_file(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes, *, shared: bool = False) -> None:
     """Write a file through a draft, flushed to the disk."""
-    with draft(path) as name:
+    with draft(path, shared=shared) as name:
         write_flushed(name, data)
 
 
