@@ -35,8 +35,8 @@ class State(NamedTuple):
     auxiliary: sac.State
     actor: Params
     log_temperature: Float[Array, ""]
-    actor_memory: optax.OptState
-    temperature_memory: optax.OptState
+    actor_opt_state: optax.OptState
+    temperature_opt_state: optax.OptState
 
 
 class Inputs(NamedTuple):
@@ -85,7 +85,7 @@ class ADSAC:
         auxiliary_key, augmented_key = jax.random.split(key)
         auxiliary = self.learner.init(replace(spec, delay=self.auxiliary_delay), auxiliary_key)
         own = self.learner.init(spec, augmented_key)
-        return State(auxiliary, own.actor, own.log_temperature, own.actor_memory, own.temperature_memory)
+        return State(auxiliary, own.actor, own.log_temperature, own.actor_opt_state, own.temperature_opt_state)
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """The augmented actor; in training, who acts is what `behaviour` says."""
@@ -108,7 +108,7 @@ class ADSAC:
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One critic update; every `actor_every`-th time rounds of a coin's choice of actor, and both temperatures."""
         auxiliary_key, augmented_key, actor_key = jax.random.split(key, 3)
-        now, later = self.inputs(windows, 0), self.inputs(windows, windows.steps)
+        now, later = self.inputs(windows, 0), self.inputs(windows, windows.n_step)
         temperatures = {
             "temperature": jnp.exp(state.log_temperature),
             "auxiliary_temperature": jnp.exp(state.auxiliary.log_temperature),
@@ -117,7 +117,7 @@ class ADSAC:
         auxiliary, metrics = self.learner.learn_critic(state.auxiliary, windows, now.auxiliary, next_value)
         state = jax.lax.cond(
             count % self.learner.actor_every == self.learner.actor_every - 1,
-            lambda state: self._improve(state, now, actor_key),
+            lambda state: self._improve(state, now, windows.action.shape[-1], actor_key),
             lambda state: state,
             state._replace(auxiliary=auxiliary),
         )
@@ -145,25 +145,25 @@ class ADSAC:
     def inputs(self, windows: Window, ahead: int | Array) -> Inputs:
         """x^τ and x, `ahead` steps after t, for each window."""
 
-        def one(window: Window, k: Array) -> Inputs:
+        def of_window(window: Window, k: Array) -> Inputs:
             pair = (view(window, k, delay) for delay in (self.auxiliary_delay, None))
             return Inputs(*(network_input(seen, "augmented") for seen in pair))
 
-        return jax.vmap(one)(windows, jnp.broadcast_to(ahead, windows.steps.shape))
+        return jax.vmap(of_window)(windows, jnp.broadcast_to(ahead, windows.n_step.shape))
 
-    def _improve(self, state: State, now: Inputs, key: Key) -> State:
+    def _improve(self, state: State, now: Inputs, action_size: int, key: Key) -> State:
         """Rounds of one actor's improvement, and of both temperatures' adjustment; all by the values of x^τ."""
         for update_key in jax.random.split(key, self.learner.actor_updates):
-            coin_key, draw, auxiliary_key, augmented_key = jax.random.split(update_key, 4)
+            coin_key, policy_key, auxiliary_key, augmented_key = jax.random.split(update_key, 4)
             state = jax.lax.cond(
                 jax.random.bernoulli(coin_key),
-                lambda state, draw: self.improve_auxiliary(state, now, draw),
-                lambda state, draw: self.improve_augmented(state, now, draw),
+                lambda state, key: self.improve_auxiliary(state, now, key),
+                lambda state, key: self.improve_augmented(state, now, key),
                 state,
-                draw,
+                policy_key,
             )
-            auxiliary = self.learner.adjust_temperature(state.auxiliary, now.auxiliary, auxiliary_key)
-            own = self.learner.adjust_temperature(augmented_learner(state), now.augmented, augmented_key)
+            auxiliary = self.learner.adjust_temperature(state.auxiliary, now.auxiliary, action_size, auxiliary_key)
+            own = self.learner.adjust_temperature(augmented_learner(state), now.augmented, action_size, augmented_key)
             state = with_augmented(state._replace(auxiliary=auxiliary), own)
         return state
 

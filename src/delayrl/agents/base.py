@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -104,23 +103,6 @@ class Schedule:
     precision: Annotated[Precision, "of the products of matrices, where the device has a choice"] = "float32"
 
 
-class Preset(NamedTuple):
-    """Hyperparameters and schedule that belong together."""
-
-    agent: Agent
-    schedule: Schedule
-
-
-class Entry(NamedTuple):
-    """One line of the registry."""
-
-    summary: str
-    paper: str
-    presets: dict[str, Preset]
-    official: Mapping[str, Any] = MappingProxyType({})  # hyperparameters that the official protocol changes
-    drops_last_starts: bool = False  # in the official protocol: its n-step window is cleared at an episode's end
-
-
 def template(agent: Agent, spec: Spec) -> State:
     """Shapes and types of the agent's state, without computing it. Raises what `init` raises."""
     key = jax.eval_shape(lambda: jax.random.key(0))  # a shape too: no device is touched
@@ -131,14 +113,14 @@ def descend(
     optimiser: optax.GradientTransformation,
     loss: Callable[..., Any],
     params: Params,
-    memory: optax.OptState,
+    opt_state: optax.OptState,
     *args: Any,
 ) -> tuple[Params, optax.OptState, Any, Any]:
     """One step of gradient descent on `loss(params, *args) -> (value, extra)`.
 
     Returns:
-        The new parameters, the optimiser's new memory, the loss and the extra.
+        The new parameters, the optimiser's new state, the loss and the extra.
     """
     (value, extra), gradient = jax.value_and_grad(loss, has_aux=True)(params, *args)
-    change, memory = optimiser.update(gradient, memory, params)
-    return optax.apply_updates(params, change), memory, value, extra
+    change, opt_state = optimiser.update(gradient, opt_state, params)
+    return optax.apply_updates(params, change), opt_state, value, extra

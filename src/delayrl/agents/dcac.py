@@ -32,12 +32,12 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Actor and critics, the critics' targets, and what the one optimiser remembers."""
+    """Actor and critics, the critics' targets, and the state of their one optimiser."""
 
     actor: Params
     critic: Params
     target: Params
-    memory: optax.OptState
+    opt_state: optax.OptState
 
 
 class Roll(NamedTuple):
@@ -87,8 +87,8 @@ class DCAC:
         size = input_size(spec, "augmented")
         actor = networks.mlp_init(actor_key, (size, *self.hidden, 2 * spec.action_size))
         critic = networks.twin_init(critic_key, (size, *self.hidden, 1))
-        memory = optax.adam(self.learning_rate).init((actor, critic))
-        return State(actor, critic, jax.tree.map(jnp.copy, critic), memory)
+        opt_state = optax.adam(self.learning_rate).init((actor, critic))
+        return State(actor, critic, jax.tree.map(jnp.copy, critic), opt_state)
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
         """The actor's Gaussian at inputs `x`."""
@@ -105,17 +105,17 @@ class DCAC:
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One step of actor and critics together; then of the targets."""
-        (actor, critic), memory, _, metrics = descend(
+        (actor, critic), opt_state, _, metrics = descend(
             optax.adam(self.learning_rate),
             self.loss,
             (state.actor, state.critic),
-            state.memory,
+            state.opt_state,
             state.target,
             windows,
             key,
         )
         target = optax.incremental_update(critic, state.target, self.target_rate)
-        return State(actor, critic, target, memory), metrics
+        return State(actor, critic, target, opt_state), metrics
 
     def loss(self, params: tuple[Params, Params], target: Params, windows: Window, key: Key) -> tuple[Array, Metrics]:
         """The critics' squared error and the actor's negative soft value, both over the same stretches."""
@@ -151,10 +151,10 @@ class DCAC:
         must be known, because re-sampled stretches lead there.
         """
         delay, slots = window.delay, jnp.arange(window.delay)
-        coin, draw = jax.random.split(key)
+        coin_key, policy_key = jax.random.split(key)
         over = window.terminated.any()
-        late = over & jax.random.bernoulli(coin)
-        window = shift(window, jnp.where(late, window.lead, 0))
+        from_end = over & jax.random.bernoulli(coin_key)
+        window = shift(window, jnp.where(from_end, window.lead, 0))
 
         def step(actions: Array, now: tuple[Array, Key]) -> tuple[Array, Array]:
             i, key = now
@@ -162,13 +162,13 @@ class DCAC:
             action, log_prob = networks.sample(self.policy(actor, x), key)
             return actions.at[delay + i].set(action), log_prob
 
-        actions, log_prob = jax.lax.scan(step, window.action, (slots, jax.random.split(draw, delay)))
+        actions, log_prob = jax.lax.scan(step, window.action, (slots, jax.random.split(policy_key, delay)))
         # ages are known up to the window's last row; and after a termination, where nothing else is left to arrive
         true_still = (window.age[delay + 1 :] > slots) & ((slots < window.lead) | over)
         steps = jnp.cumprod(true_still.astype(jnp.int32)).sum()
         newest = delay + jnp.arange(delay + 1) - window.age[delay:]
         received = jnp.concatenate([jnp.zeros(1), jnp.cumsum(window.reward)])  # [c]: all before r_c
-        first = jnp.where(late, delay - window.lead, 0)
+        first = jnp.where(from_end, delay - window.lead, 0)
         x, x_last = (network_input(view(replace(window, action=actions), i), "augmented") for i in (first, steps))
         return Roll(
             x,
@@ -176,7 +176,7 @@ class DCAC:
             jnp.roll(jnp.diff(received[newest]), -first),
             jnp.roll(log_prob, -first),
             steps - first,
-            late,
+            from_end,
         )
 
 
@@ -191,4 +191,4 @@ def shift(window: Window, by: Int[Array, ""]) -> Window:
 
 def values(critic: Params, x: Float[Array, "*batch input"]) -> Float[Array, "2 *batch"]:
     """Both critics' V(x)."""
-    return jnp.stack([networks.mlp(one, x)[..., 0] for one in critic])
+    return jnp.stack([networks.mlp(params, x)[..., 0] for params in critic])

@@ -29,11 +29,11 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """The expert, the student with what its optimiser remembers, and how far the run is."""
+    """The expert, the student with its optimiser's state, and how far the run is."""
 
     reference: sac.State
     student: Params
-    memory: optax.OptState
+    opt_state: optax.OptState
     steps: Int[Array, ""]  # environment steps that have been learned from: who acts depends on it
 
 
@@ -47,7 +47,7 @@ class DIDA:
     imitation_updates: Annotated[int, "updates after each round, on fresh batches of all the data"] = 1000
     student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)
     student_learning_rate: Annotated[float, "RMSprop's step size", (0.0, 1.0)] = 1e-3
-    student_decay: Annotated[float, "RMSprop's memory of squared gradients", (0.0, 1.0)] = 0.9
+    student_decay: Annotated[float, "decay of RMSprop's mean of squared gradients", (0.0, 1.0)] = 0.9
     student_batch_size: Annotated[int, "windows in a batch of imitation"] = 32
 
     privileged = True
@@ -129,20 +129,20 @@ class DIDA:
     def imitate(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One update of the student, once the expert has finished: for the first time before the student acts."""
 
-        def learn(student: Params, memory: optax.OptState) -> tuple[Params, optax.OptState, Array]:
-            student, memory, loss, _ = descend(
-                self.optimiser, self.imitation_loss, student, memory, state.reference.actor, windows
+        def learn(student: Params, opt_state: optax.OptState) -> tuple[Params, optax.OptState, Array]:
+            student, opt_state, loss, _ = descend(
+                self.optimiser, self.imitation_loss, student, opt_state, state.reference.actor, windows
             )
-            return student, memory, loss
+            return student, opt_state, loss
 
-        student, memory, loss = jax.lax.cond(
+        student, opt_state, loss = jax.lax.cond(
             count // self.imitation_updates * self.round_steps >= self.expert_steps,
             learn,
-            lambda student, memory: (student, memory, jnp.zeros(())),
+            lambda student, opt_state: (student, opt_state, jnp.zeros(())),
             state.student,
-            state.memory,
+            state.opt_state,
         )
-        return state._replace(student=student, memory=memory), {"imitation_loss": loss}
+        return state._replace(student=student, opt_state=opt_state), {"imitation_loss": loss}
 
     def imitation_loss(self, student: Params, expert: Params, windows: Window) -> tuple[Array, None]:
         """Σ |a_student(x_t) - a_expert(s_t)| over batch and dimensions; the expert's action is its mode."""

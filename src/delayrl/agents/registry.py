@@ -1,27 +1,57 @@
 """The registry: every agent with its presets. To add one: its file, its line here, its page in docs/algorithms."""
 
+import difflib
 from dataclasses import replace
+from typing import NamedTuple
 
 from delayrl.agents.adsac import ADSAC
-from delayrl.agents.base import Entry, Preset, Schedule
+from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.dcac import DCAC
 from delayrl.agents.dida import DIDA
 from delayrl.agents.lifting import Lifting
 from delayrl.agents.random import Random
 from delayrl.agents.sac import BPQL, SAC
 from delayrl.agents.vdpo import VDPO
+from delayrl.core.protocol import CORRECTED, OFFICIAL, Protocol
+from delayrl.errors import DelayRLError
 
+
+class Preset(NamedTuple):
+    """Hyperparameters and schedule that belong together."""
+
+    agent: Agent
+    schedule: Schedule
+
+
+class Registration(NamedTuple):
+    """One line of the registry."""
+
+    summary: str
+    paper: str
+    presets: dict[str, Preset]
+    official: Protocol = OFFICIAL
+
+    def protocol(self, name: str) -> Protocol:
+        """Return a protocol by its name. Raises DelayRLError for an unknown one."""
+        protocols = {"corrected": CORRECTED, "official": self.official}
+        if name not in protocols:
+            raise DelayRLError(f"protocol must be corrected or official; got {name!r}")
+        return protocols[name]
+
+
+_CLEARED = replace(OFFICIAL, last_starts="dropped")
+"""Released code whose n-step window is cleared at the end of an episode."""
 _PAPER = Schedule()
 _SMALL = Schedule(
     steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500, evaluation_episodes=10
 )
 
 
-def _soft(summary: str, paper: str, **sees: str) -> Entry:
+def _soft(summary: str, paper: str, **sees: str) -> Registration:
     """SAC on two views: it differs in what is seen alone, so that nothing else explains a difference."""
     agent = SAC(**sees)  # type: ignore[arg-type]
     presets = {"paper": Preset(agent, _PAPER), "small": Preset(replace(agent, batch_size=128), _SMALL)}
-    return Entry(summary, paper, presets)
+    return Registration(summary, paper, presets)
 
 
 _small_vdpo = VDPO(
@@ -31,36 +61,35 @@ _small_adsac = ADSAC(SAC(actor_sees="augmented", critic_sees="augmented", batch_
 _small_lifting = Lifting(SAC(actor_sees="augmented", batch_size=128), lifting_hold=3_750, lifting_end=11_250)
 _small_dida = DIDA(SAC(batch_size=128), expert_steps=10_000, round_steps=250, imitation_updates=250)
 
-AGENTS: dict[str, Entry] = {
-    "vdpo": Entry(
+AGENTS: dict[str, Registration] = {
+    "vdpo": Registration(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
         {"paper": Preset(VDPO(), _PAPER), "small": Preset(_small_vdpo, _SMALL)},
-        drops_last_starts=True,
+        official=_CLEARED,
     ),
-    "lifting": Entry(
+    "lifting": Registration(
         "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
         "Lee et al., 2026, arXiv 2604.03641",
         {"paper": Preset(Lifting(), replace(_PAPER, random_steps=10_000)), "small": Preset(_small_lifting, _SMALL)},
     ),
-    "ad-sac": Entry(
+    "ad-sac": Registration(
         "learns values for a shorter delay, and improves the actor of the long one by them",
         "Wu et al., ICML 2024",
         {"paper": Preset(ADSAC(), _PAPER), "small": Preset(_small_adsac, _SMALL)},
-        official={"evaluation": "sample"},
-        drops_last_starts=True,
+        official=replace(_CLEARED, overrides={"evaluation": "sample"}),
     ),
-    "dida": Entry(
+    "dida": Registration(
         "a student on x_t imitates a delay-free SAC expert (DAgger); the expert's steps are counted",
         "Liotet et al., ICML 2022",
         {"paper": Preset(DIDA(), _PAPER), "small": Preset(_small_dida, _SMALL)},
     ),
-    "dcac": Entry(
+    "dcac": Registration(
         "learns values on past stretches whose actions are sampled again inside the augmented state",
         "Bouteiller, Ramstedt et al., ICLR 2021",
         {"paper": Preset(DCAC(), replace(_PAPER, random_steps=10_000)), "small": Preset(DCAC(), _SMALL)},
     ),
-    "bpql": Entry(
+    "bpql": Registration(
         "SAC whose actor sees x_t and whose critic sees s_t",
         "Kim et al., NeurIPS 2023",
         {
@@ -81,9 +110,17 @@ AGENTS: dict[str, Entry] = {
         critic_sees="delayed",
     ),
     "sac": _soft("the delay-free reference: trains with --delay 0", "Haarnoja et al., ICML 2018"),
-    "random": Entry(
+    "random": Registration(
         "uniform actions",
         "-",
         {name: Preset(Random(), s) for name, s in (("paper", _PAPER), ("small", _SMALL))},
     ),
 }
+
+
+def find_agent(name: str) -> Registration:
+    """Return an agent's line in the registry. Raises DelayRLError with the nearest names for an unknown one."""
+    if name not in AGENTS:
+        near = difflib.get_close_matches(name, AGENTS, n=2, cutoff=0.4) or AGENTS
+        raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")
+    return AGENTS[name]

@@ -33,15 +33,15 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Networks, their targets, and what their optimisers remember."""
+    """Networks, their targets, and the states of their optimisers."""
 
     actor: Params
     critic: Params
     target: Params
     log_temperature: Float[Array, ""]
-    actor_memory: optax.OptState
-    critic_memory: optax.OptState
-    temperature_memory: optax.OptState
+    actor_opt_state: optax.OptState
+    critic_opt_state: optax.OptState
+    temperature_opt_state: optax.OptState
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,8 @@ class SAC:
         """
         target_key, actor_key = jax.random.split(key)
         actor_now, critic_now = self._inputs(windows, 0)
-        actor_next, critic_next = self._inputs(windows, windows.steps)
+        actor_next, critic_next = self._inputs(windows, windows.n_step)
+        action_size = windows.action.shape[-1]
 
         temperature = jnp.exp(state.log_temperature)
         action, log_prob = networks.sample(self.policy(state.actor, actor_next), target_key)
@@ -144,9 +145,9 @@ class SAC:
 
         def improve(state: State) -> State:
             for update_key in jax.random.split(actor_key, self.actor_updates):
-                draw, redraw = jax.random.split(update_key)
-                state = self.improve_actor(state, actor_now, critic_now, draw, penalty)
-                state = self.adjust_temperature(state, actor_now, redraw)
+                policy_key, temperature_key = jax.random.split(update_key)
+                state = self.improve_actor(state, actor_now, critic_now, policy_key, penalty)
+                state = self.adjust_temperature(state, actor_now, action_size, temperature_key)
             return state
 
         state = jax.lax.cond(count % self.actor_every == self.actor_every - 1, improve, lambda state: state, state)
@@ -156,24 +157,24 @@ class SAC:
         self, state: State, windows: Window, critic_input: Array, next_value: Float[Array, " batch"]
     ) -> tuple[State, Metrics]:
         """One step of both critics towards the soft k-step target, given V(s_{t+k}); and of their targets."""
-        now, last = windows.delay, windows.delay + windows.steps - 1
+        now, last = windows.delay, windows.delay + windows.n_step - 1
         y = soft_target(
-            k_step_return(windows.reward[:, now:], self.discount, windows.steps),
-            self.discount**windows.steps,
+            k_step_return(windows.reward[:, now:], self.discount, windows.n_step),
+            self.discount**windows.n_step,
             jnp.take_along_axis(windows.terminated, last[:, None], 1)[:, 0],
             next_value,
         )
-        critic, critic_memory, loss, q = descend(
+        critic, critic_opt_state, loss, q = descend(
             optax.adam(self.critic_learning_rate),
             critic_loss,
             state.critic,
-            state.critic_memory,
+            state.critic_opt_state,
             critic_input,
             windows.action[:, now],
             y,
         )
         target = optax.incremental_update(critic, state.target, self.target_rate)
-        state = state._replace(critic=critic, critic_memory=critic_memory, target=target)
+        state = state._replace(critic=critic, critic_opt_state=critic_opt_state, target=target)
         return state, {"critic_loss": loss, "q": q}
 
     def improve_actor(
@@ -193,24 +194,26 @@ class SAC:
             value = soft_value(networks.twin(state.critic, critic_input, action), log_prob, temperature)
             return -value.mean() + (penalty(policy) if penalty else 0.0), None
 
-        actor, actor_memory, _, _ = descend(optax.adam(self.actor_learning_rate), loss, state.actor, state.actor_memory)
-        return state._replace(actor=actor, actor_memory=actor_memory)
+        actor, actor_opt_state, _, _ = descend(
+            optax.adam(self.actor_learning_rate), loss, state.actor, state.actor_opt_state
+        )
+        return state._replace(actor=actor, actor_opt_state=actor_opt_state)
 
-    def adjust_temperature(self, state: State, actor_input: Array, key: Key) -> State:
+    def adjust_temperature(self, state: State, actor_input: Array, action_size: int, key: Key) -> State:
         """One step of the temperature towards the target entropy, on a sample of its own."""
-        target_entropy = self.entropy_per_action * state.actor[-1]["b"].shape[-1] / 2
+        target_entropy = self.entropy_per_action * action_size
         _, log_prob = networks.sample(self.policy(state.actor, actor_input), key)
-        log_temperature, temperature_memory, _, _ = descend(
+        log_temperature, temperature_opt_state, _, _ = descend(
             optax.adam(self.temperature_learning_rate),
             lambda log_temperature: (temperature_loss(log_temperature, log_prob, target_entropy), None),
             state.log_temperature,
-            state.temperature_memory,
+            state.temperature_opt_state,
         )
-        return state._replace(log_temperature=log_temperature, temperature_memory=temperature_memory)
+        return state._replace(log_temperature=log_temperature, temperature_opt_state=temperature_opt_state)
 
     def _inputs(self, windows: Window, ahead: int | Array) -> tuple[Array, Array]:
         """What actor and critic see `ahead` steps after t, for each window."""
-        ahead = jnp.broadcast_to(ahead, windows.steps.shape)
+        ahead = jnp.broadcast_to(ahead, windows.n_step.shape)
         pair = jax.vmap(lambda window, k: (look(window, self.actor_sees, k), look(window, self.critic_sees, k)))
         return pair(windows, ahead)
 

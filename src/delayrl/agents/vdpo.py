@@ -41,8 +41,8 @@ class State(NamedTuple):
     encoder: Params
     decoder: Params
     head: Params
-    belief_memory: optax.OptState
-    clone_memory: optax.OptState
+    belief_opt_state: optax.OptState
+    clone_opt_state: optax.OptState
 
 
 class Unseen(NamedTuple):
@@ -118,8 +118,10 @@ class VDPO:
         dropout_key, delayed_key, reference_key, coin_key = jax.random.split(key, 4)
         every_age = self.policy(state, seen.obs, seen.actions, dropout_key if explore else None)
         current = self.reference.policy(state.reference.actor, seen.obs)
+        row = jnp.maximum(seen.age - 1, 0)  # row i serves the age i + 1; at age 0 the reference acts
         policy = Gaussian(
-            *(jnp.where(seen.age > 0, d[seen.age - 1], c) for d, c in zip(every_age, current, strict=True))
+            jnp.where(seen.age > 0, every_age.mean[row], current.mean),
+            jnp.where(seen.age > 0, every_age.log_std[row], current.log_std),
         )
         if not explore:
             return networks.mode(policy)
@@ -146,28 +148,30 @@ class VDPO:
         state = state._replace(reference=reference)
         if self.representation != "transformer":
             return state, metrics
-        (encoder, decoder), memory, loss, _ = descend(
+        (encoder, decoder), opt_state, loss, _ = descend(
             optax.adam(self.learning_rate),
             self.belief_loss,
             (state.encoder, state.decoder),
-            state.belief_memory,
+            state.belief_opt_state,
             unseen(windows),
             dropout_key,
         )
-        return state._replace(encoder=encoder, decoder=decoder, belief_memory=memory), metrics | {"belief_loss": loss}
+        return state._replace(encoder=encoder, decoder=decoder, belief_opt_state=opt_state), metrics | {
+            "belief_loss": loss
+        }
 
     def clone(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """(B) One KL update of the policy head towards the reference (eq. 11); the encoder stays where it is."""
-        cloned, memory, loss, _ = descend(
+        cloned, opt_state, loss, _ = descend(
             optax.adam(self.learning_rate),
             self.clone_loss,
             self._cloned(state.encoder, state.head),
-            state.clone_memory,
+            state.clone_opt_state,
             state,
             unseen(windows),
             key,
         )
-        return state._replace(**cloned, clone_memory=memory), {"kl": loss}
+        return state._replace(**cloned, clone_opt_state=opt_state), {"kl": loss}
 
     def policy(self, state: State, obs: Array, actions: Array, key: Key | None = None) -> Gaussian:
         """The delayed policy for every age 1..Δ: [..., Δ, A]."""
@@ -206,11 +210,11 @@ class VDPO:
 def unseen(windows: Window) -> Unseen:
     """x_{t+1} with all the Δ steps that it hides (fewer at the start of an episode), for each window."""
 
-    def one(window: Window) -> Unseen:
+    def of_window(window: Window) -> Unseen:
         now = window.delay + 1
         age = window.valid[1:now].sum()
         x = view(window, 1, age=age)
         slots = jnp.arange(window.delay)
         return Unseen(x.obs, x.actions, window.obs[jnp.minimum(now - age + 1 + slots, now)], slots < age)
 
-    return jax.vmap(one)(windows)
+    return jax.vmap(of_window)(windows)

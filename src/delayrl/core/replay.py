@@ -46,18 +46,19 @@ def init(spec: Spec, capacity: int) -> Replay:
     )
 
 
-def append(replay: Replay, step: Transition, whole: int = 1) -> Replay:
+def append(replay: Replay, step: Transition, min_episode_steps: int = 1) -> Replay:
     """Store one step: its row, and its outcome in the next row, which the episode's next step will complete.
 
-    A step can be drawn once `whole` steps of its episode are there, itself included: with 1 every one, with more the
-    last whole - 1 of an episode never (as released code whose n-step window is cleared at its end).
+    A step can be drawn once `min_episode_steps` steps of its episode are there, counted from the step on. With 1 every
+    step can be drawn; with more, the last `min_episode_steps` - 1 of an episode never can (as in released code that
+    clears its n-step window at the end of an episode).
     """
     capacity = replay.obs.shape[0]
     here, after = replay.rows % capacity, (replay.rows + 1) % capacity
     rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps its last observation's row
     moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before it is written, or all is copied
-    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (whole - 1))
-    steps, lost = replay.steps + (moment >= whole), replay.lost
+    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (min_episode_steps - 1))
+    steps, lost = replay.steps + (moment >= min_episode_steps), replay.lost
     for _ in range(2):  # at most two rows are overwritten
         lost += ((lost < steps) & (row_of[lost % capacity] <= rows - capacity)).astype(jnp.int32)
     return Replay(
@@ -114,6 +115,6 @@ def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden:
         terminated=acted & replay.terminated[index],
         valid=valid,
         lead=lead,
-        steps=jnp.minimum(drawn, lead),
+        n_step=jnp.minimum(drawn, lead),
         delay=delay,
     )

@@ -57,15 +57,15 @@ class Transition(NamedTuple):
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["obs", "age", "action", "reward", "terminated", "valid", "lead", "steps"],
+    data_fields=["obs", "age", "action", "reward", "terminated", "valid", "lead", "n_step"],
     meta_fields=["delay"],
 )
 @dataclass(frozen=True)
 class Window:
     """A stretch of one episode around the step t that is learned from; t stands at index Δ.
 
-    Rows outside the episode, or not arrived yet, are zeros and not `valid`. `steps` is the length k of this
-    sample's k-step target, drawn from 1..ahead and cut where the known part of the episode ends (`lead` ≥ k).
+    Rows outside the episode, or not arrived yet, are zeros and not `valid`. `lead` counts the valid rows after t.
+    `n_step` is the length k ≤ `lead` of this sample's k-step target, drawn from 1..ahead.
     """
 
     obs: Float[Array, "time obs"]
@@ -75,5 +75,5 @@ class Window:
     terminated: Bool[Array, " time"]
     valid: Bool[Array, " time"]
     lead: Int[Array, ""]
-    steps: Int[Array, ""]
+    n_step: Int[Array, ""]
     delay: int

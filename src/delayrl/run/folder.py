@@ -1,52 +1,42 @@
 """Run folders: configuration, rows, metrics, checkpoints. Text is JSON, arrays are safetensors; nothing is pickled.
 
 ```
-config.json     what is trained, on what, with which versions
-rows.jsonl      one row for each evaluation episode
-metrics.jsonl   losses and speed
-curve.png       return against steps
+config.json         what is trained, on what, with which versions
+rows.jsonl          one row for each evaluation episode
+metrics.jsonl       losses and speed
+curve.png           return against steps
 checkpoints/STEP/   agent.safetensors, loop.safetensors, manifest.json (checksums); the last two are kept
-replay/         the trajectory in pieces, each written once; gone when the run is complete
+replay/             the trajectory in pieces, each written once; deleted when the run is complete
 ```
 """
 
 import contextlib
-import errno
-import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
-import safetensors
-import safetensors.numpy
-from numpy.typing import NDArray
-
 from delayrl.errors import DelayRLError
+from delayrl.run.arrays import Arrays, save_arrays
+from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
+from delayrl.run.disk import disk_errors, draft, remove, write_file, write_flushed
 
 FORMAT = 1
-CONFIG = {"agent": str, "preset": str, "env": str, "delay": int | str, "hyperparameters": dict, "schedule": dict}
-"""What a configuration must hold, and of which type."""
-Arrays = dict[str, NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint whose checksums hold."""
-
-    path: Path
-    step: int
-    complete: bool
-    pieces: dict[str, str]
-
-    def arrays(self, name: str) -> Arrays:
-        """One of its files."""
-        return load_arrays(self.path / f"{name}.safetensors")
+CONFIG = {
+    "format": int,
+    "agent": str,
+    "preset": str,
+    "env": str,
+    "delay": int | str,
+    "hyperparameters": dict,
+    "schedule": dict,
+}
+"""What a configuration must hold, with its types."""
+FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
+FILES = ("rows.jsonl", "metrics.jsonl", "curve.png", "delays.png", "config.json")
 
 
 @dataclass(frozen=True)
@@ -56,8 +46,20 @@ class Run:
     path: Path
 
     @property
+    def exists(self) -> bool:
+        """Whether a run has begun here."""
+        return (self.path / "config.json").exists()
+
+    @property
+    def is_free(self) -> bool:
+        """Whether a new run may begin here: there is no folder, or an empty one (drafts of a crash aside)."""
+        if not self.path.exists():
+            return True
+        return self.path.is_dir() and all(file.name.endswith(".draft") for file in self.path.iterdir())
+
+    @property
     def config(self) -> dict[str, Any]:
-        """What was trained. Raises DelayRLError where the folder is no run."""
+        """What was trained. Raises DelayRLError if the folder is no run."""
         file = self.path / "config.json"
         if not file.is_file():
             raise DelayRLError(f"{self.path} is not a run folder: it has no config.json")
@@ -65,7 +67,7 @@ class Run:
             config = json.loads(file.read_text())
         except (ValueError, OSError) as error:
             raise DelayRLError(f"{file} is damaged: {type(error).__name__}") from error
-        for name, kind in {"format": int, **CONFIG}.items():
+        for name, kind in CONFIG.items():
             if not isinstance(config, dict) or not isinstance(config.get(name), kind):
                 raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
         if config["format"] != FORMAT:
@@ -74,34 +76,25 @@ class Run:
 
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""
-        with _disk(self.path):
+        with disk_errors(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-            _write(self.path / "config.json", json.dumps({"format": FORMAT, **config}, indent=1).encode())
+            write_file(self.path / "config.json", json.dumps({"format": FORMAT, **config}, indent=1).encode())
 
     def remove(self) -> None:
-        """Delete what a run put there, and nothing else."""
-        with _disk(self.path):
-            for name in ("checkpoints", "replay", "tensorboard", "wandb"):
-                if (self.path / name).exists():
-                    shutil.rmtree(self.path / name)
-            for name in ("rows.jsonl", "metrics.jsonl", "curve.png", "delays.png", "config.json"):
-                (self.path / name).unlink(missing_ok=True)
-
-    def is_free(self) -> bool:
-        """Whether a new run may begin here: no folder yet, or an empty one (drafts of a crash aside)."""
-        return not self.path.exists() or (
-            self.path.is_dir() and all(file.name.endswith(".draft") for file in self.path.iterdir())
-        )
+        """Delete what a run puts into its folder, and nothing else."""
+        with disk_errors(self.path):
+            for name in FOLDERS + FILES:
+                remove(self.path / name)
 
     def append(self, name: str, rows: list[dict[str, Any]]) -> None:
         """Add lines to rows.jsonl or metrics.jsonl."""
-        with _disk(self.path), open(self.path / f"{name}.jsonl", "a") as file:
+        with disk_errors(self.path), open(self.path / f"{name}.jsonl", "a") as file:
             file.write("".join(json.dumps(row) + "\n" for row in rows))
             file.flush()
             os.fsync(file.fileno())
 
     def read(self, name: str) -> list[dict[str, Any]]:
-        """The lines of rows.jsonl or metrics.jsonl; a last line that a crash cut off is left out."""
+        """Return the lines of rows.jsonl or metrics.jsonl, without a last line that a crash cut off."""
         file = self.path / f"{name}.jsonl"
         try:
             lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
@@ -110,37 +103,30 @@ class Run:
             raise DelayRLError(f"{file} is damaged: {error}") from error
 
     def rewind(self, step: int) -> None:
-        """Forget rows and checkpoints after the step that a run is resumed from: they will be made again."""
-        with _disk(self.path):
+        """Delete rows and checkpoints of later steps than `step`: the resumed run makes them again."""
+        with disk_errors(self.path):
             for name in ("rows", "metrics"):
                 if (self.path / f"{name}.jsonl").is_file():
                     kept = [row for row in self.read(name) if row["step"] <= step]
-                    _write(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
-            for later in (self.path / "checkpoints").glob("[0-9]*"):
+                    write_file(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
+            for later in checkpoint_folders(self.path):
                 if int(later.name) > step:
-                    _forget(later)
+                    _delete_checkpoint(later)
 
     def checkpoints(self) -> tuple[list[Checkpoint], list[str]]:
-        """The good checkpoints, newest first, and one line for each broken one."""
+        """Return the good checkpoints, newest first, and one line for each broken one."""
         good, broken = [], []
-        for path in sorted((self.path / "checkpoints").glob("[0-9]*"), reverse=True):
+        for path in checkpoint_folders(self.path):
             try:
-                manifest = json.loads((path / "manifest.json").read_text())
-                if manifest["step"] != int(path.name) or "agent.safetensors" not in manifest["files"]:
-                    raise DelayRLError("its manifest is damaged")
-                if not manifest["complete"] and "loop.safetensors" not in manifest["files"]:
-                    raise DelayRLError("its manifest is damaged")
-                for file, digest in (manifest["files"] | manifest["pieces"]).items():
-                    home = self.path / "replay" if file in manifest["pieces"] else path
-                    if Path(file).name != file or _digest(home / file) != digest:
-                        raise DelayRLError(f"{file} is cut or changed")
-                good.append(Checkpoint(path, int(path.name), bool(manifest["complete"]), manifest["pieces"]))
-            except (OSError, ValueError, KeyError, TypeError, AttributeError, DelayRLError) as error:
+                checkpoint = read_checkpoint(path)
+                checkpoint.check()
+                good.append(checkpoint)
+            except (OSError, DelayRLError) as error:
                 broken.append(f"checkpoint {path} is broken ({error}); it is left out")
         return good, broken
 
     def latest(self) -> Checkpoint:
-        """The newest good checkpoint; DelayRLError where there is none."""
+        """Return the newest good checkpoint. Raises DelayRLError if there is none."""
         good, broken = self.checkpoints()
         if not good:
             raise DelayRLError(broken[0] if broken else f"{self.path} has no checkpoint yet")
@@ -149,118 +135,60 @@ class Run:
     def save(
         self, step: int, agent: Arrays, loop: Arrays | None, pieces: dict[str, str], *, complete: bool = False
     ) -> None:
-        """Write a checkpoint beside the older ones, put it in place at once, and keep the one before it."""
-        home = self.path / "checkpoints"
-        draft, final = home / ".draft", home / f"{step:012d}"
-        with _disk(self.path):
-            shutil.rmtree(draft, ignore_errors=True)
-            draft.mkdir(parents=True)
-            files = {"agent.safetensors": agent} | ({"loop.safetensors": loop} if loop is not None else {})
-            digests = {name: save_arrays(draft / name, arrays) for name, arrays in files.items()}
-            manifest = {"step": step, "complete": complete, "files": digests, "pieces": pieces}
-            _write(draft / "manifest.json", json.dumps(manifest).encode())
+        """Write a checkpoint, and delete all but the one before it.
+
+        Args:
+            step: environment steps of the seed so far.
+            agent: the agent's state.
+            loop: what a resumed run needs besides; None for a complete one.
+            pieces: checksums of the replay's files.
+            complete: whether training is over.
+        """
+        final = self.path / "checkpoints" / f"{step:012d}"
+        with disk_errors(self.path):
+            final.parent.mkdir(parents=True, exist_ok=True)
             if final.exists():
-                _forget(final)
-            draft.rename(final)
-        for old in sorted(home.glob("[0-9]*"))[:-2]:
-            shutil.rmtree(old, ignore_errors=True)
+                _delete_checkpoint(final)
+            with draft(final) as folder:
+                folder.mkdir()
+                files = {"agent.safetensors": save_arrays(folder / "agent.safetensors", agent)}
+                if loop is not None:
+                    files["loop.safetensors"] = save_arrays(folder / "loop.safetensors", loop)
+                manifest = {"step": step, "complete": complete, "files": files, "pieces": pieces}
+                write_flushed(folder / "manifest.json", json.dumps(manifest).encode())
+        self._drop_checkpoints(2)
 
     def finish(self) -> None:
         """Delete what only a run that goes on needs: the older checkpoint and the replay."""
-        for old in sorted((self.path / "checkpoints").glob("[0-9]*"))[:-1]:
-            shutil.rmtree(old, ignore_errors=True)
+        self._drop_checkpoints(1)
         shutil.rmtree(self.path / "replay", ignore_errors=True)
 
     def save_piece(self, name: str, arrays: Arrays) -> str:
-        """Write one piece of the replay; returns its checksum."""
-        with _disk(self.path):
+        """Write one piece of the replay. Returns its checksum."""
+        with disk_errors(self.path):
             (self.path / "replay").mkdir(exist_ok=True)
-            draft = self.path / "replay" / ".draft"
-            digest = save_arrays(draft, arrays)
-            draft.rename(self.path / "replay" / name)
-        return digest
+            with draft(self.path / "replay" / name) as file:
+                return save_arrays(file, arrays)
 
     def drop_pieces(self) -> None:
-        """Delete the pieces that no checkpoint names any more."""
-        named: set[str] = set()
-        for manifest in (self.path / "checkpoints").glob("[0-9]*/manifest.json"):
-            with contextlib.suppress(ValueError, KeyError):
-                named |= set(json.loads(manifest.read_text())["pieces"])
+        """Delete the pieces of the replay that no checkpoint needs any more."""
+        needed: set[str] = set()
+        for path in checkpoint_folders(self.path):
+            with contextlib.suppress(DelayRLError):
+                needed |= read_checkpoint(path).pieces.keys()
         for file in (self.path / "replay").glob("*"):
-            if file.name not in named:
+            if file.name not in needed:
                 file.unlink(missing_ok=True)
 
-
-def save_arrays(path: Path, arrays: Arrays) -> str:
-    """Write arrays as safetensors, flushed to the disk; returns the file's checksum."""
-    data = safetensors.numpy.save({name: np.array(array, order="C") for name, array in arrays.items()})
-    _write(path, data, rename=False)
-    return hashlib.sha256(data).hexdigest()
+    def _drop_checkpoints(self, kept: int) -> None:
+        abandoned = (self.path / "checkpoints").glob(".*.draft")  # by a process that was killed
+        for old in [*checkpoint_folders(self.path)[kept:], *abandoned]:
+            shutil.rmtree(old, ignore_errors=True)
 
 
-def load_arrays(path: Path) -> Arrays:
-    """Read safetensors; DelayRLError where the file is cut or something else."""
-    try:
-        return safetensors.numpy.load_file(path)
-    except (OSError, ValueError, safetensors.SafetensorError) as error:
-        raise DelayRLError(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
-
-
-def flatten_tree(tree: Any) -> Arrays:
-    """A tree of arrays as names and arrays."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
-
-
-def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
-    """The tree of the template's form with the stored values; DelayRLError where they belong to another agent."""
-    leaves, form = jax.tree_util.tree_flatten_with_path(template)
-    named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-    for name in sorted(named.keys() ^ arrays.keys()):
-        state = "lacks" if name in named else "has"
-        raise DelayRLError(f"{where} belongs to another agent or configuration: it {state} {name}")
-    for name, leaf in named.items():
-        if tuple(leaf.shape) != arrays[name].shape or np.dtype(leaf.dtype) != arrays[name].dtype:
-            raise DelayRLError(
-                f"{where} belongs to another agent or configuration: {name} is {arrays[name].dtype}"
-                f"{list(arrays[name].shape)}, expected {leaf.dtype}{list(leaf.shape)}"
-            )
-    return jax.tree_util.tree_unflatten(form, [arrays[name] for name in named])
-
-
-def _forget(checkpoint: Path) -> None:
-    """Delete a checkpoint at once: a crash in the middle leaves no half of it under its name."""
-    gone = checkpoint.with_name(".gone")
+def _delete_checkpoint(path: Path) -> None:
+    """Rename a checkpoint, then delete it: a crash leaves no half of it under its name."""
+    gone = path.with_name(".gone")
     shutil.rmtree(gone, ignore_errors=True)
-    checkpoint.rename(gone)
+    path.rename(gone)
     shutil.rmtree(gone)
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _write(path: Path, data: bytes, *, rename: bool = True) -> None:
-    """Write and flush; through a draft that takes the file's place at once, unless the caller renames."""
-    target = path.with_name(path.name + ".draft") if rename else path
-    try:
-        with open(target, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError:
-        target.unlink(missing_ok=True)
-        raise
-    if rename:
-        target.rename(path)
-
-
-@contextlib.contextmanager
-def _disk(path: Path) -> Iterator[None]:
-    """What the disk refuses, in one line."""
-    try:
-        yield
-    except OSError as error:
-        reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
-        raise DelayRLError(f"cannot write to {path}: {reason}; what was stored before is kept") from error

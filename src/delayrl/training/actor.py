@@ -1,11 +1,11 @@
 """The host's side of one seed: its environment, and where it is in its current episode."""
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from delayrl.core.protocol import CORRECTED, Protocol
 from delayrl.core.types import Seen, Transition
 from delayrl.core.views import seen_now
 from delayrl.errors import DelayRLError
@@ -13,59 +13,66 @@ from delayrl.play.evaluation import TRAINING, reset_seed
 from delayrl.wrappers import Delayed
 
 
-@dataclass
 class Actor:
-    """One seed's environment, and where it is in its current episode."""
+    """One seed's environment in its current episode.
 
-    env: Delayed
-    seed: int
-    privileged: bool
-    official: bool = False
-    episode: int = 0
-    actions: list[NDArray[np.float32]] = field(default_factory=list)
-    seen: Seen = None  # type: ignore[assignment]
-    truth: NDArray[np.float32] = None  # type: ignore[assignment]
+    Attributes:
+        env: the delayed task, with actions in [-1, 1].
+        seed: the run's.
+        privileged: whether the agent's behaviour reads the true state.
+        protocol: how episodes start, and what a time limit means.
+        episode: the number of the current episode.
+        actions: those taken in it so far.
+        seen: what the agent sees now.
+        truth: the true observation now, [S].
+    """
 
-    def reset(self) -> None:
-        """Start the next episode, from its own seed (official protocol: always from the same)."""
-        self.actions = []
-        seed = self.seed if self.official else reset_seed(self.seed, TRAINING, self.episode)
-        shown = self.env.reset(seed=seed)
-        if self.official:  # one start state, but not one sequence of travel times
-            self.env.draw_from(reset_seed(self.seed, TRAINING, self.episode))
+    seen: Seen
+    truth: NDArray[np.float32]
+
+    def __init__(self, env: Delayed, seed: int, privileged: bool, protocol: Protocol = CORRECTED) -> None:
+        self.env, self.seed, self.privileged, self.protocol = env, seed, privileged, protocol
+        self.start_episode(0)
+
+    def start_episode(self, episode: int) -> None:
+        """Start an episode from its own seed, or under protocol `official` from the run's."""
+        self.episode, self.actions = episode, list[NDArray[np.float32]]()
+        own_seed = reset_seed(self.seed, TRAINING, episode)
+        if self.protocol.start_states == "same":
+            shown = self.env.reset(seed=self.seed)
+            self.env.draw_from(own_seed)  # one start state, but not one sequence of travel times
+        else:
+            shown = self.env.reset(seed=own_seed)
         self._see(*shown)
 
     def step(self, action: NDArray[np.float32]) -> Transition:
-        """Act; start the next episode where this one ends."""
+        """Act, and start the next episode if this one ends. Returns the true step."""
         if not np.isfinite(action).all():
             raise DelayRLError(f"the policy of seed {self.seed} gives actions that are not finite: training diverged")
-        before, age = self.truth, self.seen.age
+        truth, age = self.truth, self.seen.age
         obs, reward, terminated, truncated, info = self.env.step(action)
         self.actions.append(action)
         self._see(obs, info)
-        reward = float(reward)
+        reward, done = float(reward), terminated or truncated
         if not np.isfinite(reward):
             self._refuse("a reward")
-        done = terminated or truncated
-        step = Transition(
-            before,  # type: ignore[arg-type]
+        transition = Transition(
+            truth,  # type: ignore[arg-type]
             age,
             action,  # type: ignore[arg-type]
             np.float32(reward),  # type: ignore[arg-type]
-            np.bool_(done if self.official else terminated),  # type: ignore[arg-type]
+            np.bool_(done if self.protocol.time_limit == "terminates" else terminated),  # type: ignore[arg-type]
             np.bool_(done),  # type: ignore[arg-type]
             self.truth,  # type: ignore[arg-type]
             self.seen.age,
         )
         if done:
-            self.episode += 1
-            self.reset()
-        return step
+            self.start_episode(self.episode + 1)
+        return transition
 
     def replay_episode(self, episode: int, actions: NDArray[np.float32]) -> None:
         """Come back to the middle of an episode: the same seed and actions lead to the same state."""
-        self.episode = episode
-        self.reset()
+        self.start_episode(episode)
         for action in actions:
             obs, _, _, _, info = self.env.step(action)
             self.actions.append(action)

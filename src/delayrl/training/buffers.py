@@ -1,4 +1,4 @@
-"""Have the memory that an update computes in stay the process's own, where the CPU's allocator would give it back."""
+"""Keep large update buffers resident between steps (docs/performance.md)."""
 
 import ctypes
 import sys
@@ -13,28 +13,36 @@ from delayrl.core.types import Spec
 from delayrl.training.estimate import update_shapes
 
 LARGE = 50 * 2**20
-"""Bytes that the matrix products of an update yield, from which on keeping is faster (measured).
+"""Bytes of an update's matrix products from which keeping the buffers is faster (measured).
 
-What XLA allocates at once for such an update is more than the 32 MB up to which glibc keeps a block by itself.
+XLA's allocation for such an update exceeds the 32 MB up to which glibc keeps a block by itself.
 """
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
 
-def keep_memory(agent: Agent, spec: Spec, seeds: int) -> bool:
-    """Where updates are large: no fresh pages for each. Returns whether that was asked for; no result changes by it.
+def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
+    """Have the allocator keep the buffers of large updates. Call it before JAX looks for its devices.
 
-    XLA allocates what an update computes in at each call. glibc gives blocks above 32 MB back to the system at once, so
-    that all their pages are zeroed and mapped again: a sixth of an update's time. It keeps large blocks for a process's
-    main thread only; so the updates are computed there, instead of on a thread of JAX's. That costs the time of the
-    host's work beside them, and is why small updates stay where they are. Nothing is done without glibc, and off the
-    main thread. It holds for the process, and is to be asked for before JAX looks for its devices.
+    XLA allocates an update's buffers at each call. glibc returns blocks above 32 MB to the system at once, so all
+    their pages are zeroed and mapped again: a sixth of an update's time. It keeps large blocks for the main thread
+    only, so updates then run there, instead of on a thread of JAX's. That gives up computing beside the host's work,
+    which costs small updates more than it saves.
+
+    Args:
+        agent: whose updates are measured, from their shapes.
+        spec: sizes of the task.
+        seeds: how many are trained in lockstep.
+
+    Returns:
+        Whether buffers are kept from now on, in this process. Never without glibc, off the main thread, or for small
+        updates. No result depends on it.
     """
     if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
         return False
-    if not mallopt(MMAP_THRESHOLD, 2**30):  # an old glibc, which knows no more than 32 MB
+    if not mallopt(MMAP_THRESHOLD, 2**30):  # an old glibc, which accepts no more than 32 MB
         return False
     mallopt(TRIM_THRESHOLD, 2**31 - 1)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -42,7 +50,7 @@ def keep_memory(agent: Agent, spec: Spec, seeds: int) -> bool:
 
 
 def product_bytes(agent: Agent, spec: Spec) -> list[int]:
-    """Of each phase: the bytes that the matrix products of one update yield. No device is touched."""
+    """Return for each phase the bytes of the matrix products of one update. Touches no device."""
     shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
     return [sum(_products(jax.jit(phase.update).trace(*args).jaxpr)) for phase, args in shapes]
 

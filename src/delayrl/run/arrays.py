@@ -1,0 +1,69 @@
+"""Arrays on disk as safetensors, and pytrees as named arrays. Nothing is pickled."""
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import NDArray
+
+from delayrl.errors import DelayRLError, first_line
+from delayrl.run.disk import write_flushed
+
+Arrays = dict[str, NDArray[Any]]
+OLD_NAME = re.compile(r"(?<![^.])((?:\w+_)?)memory(?![^.])")
+"""Optimiser states were called "memory" in files that version 0.1 wrote."""
+
+
+def save_arrays(path: Path, arrays: Arrays) -> str:
+    """Write arrays as safetensors, flushed to the disk. Returns the file's SHA-256."""
+    data = safetensors.numpy.save({name: np.array(array, order="C") for name, array in arrays.items()})
+    write_flushed(path, data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def load_arrays(path: Path) -> Arrays:
+    """Read safetensors. Raises DelayRLError if the file is cut or something else."""
+    try:
+        arrays = safetensors.numpy.load_file(path)
+    except (OSError, ValueError, safetensors.SafetensorError) as error:
+        raise DelayRLError(f"{path} cannot be read: {first_line(error)}") from error
+    return {OLD_NAME.sub(r"\1opt_state", name): array for name, array in arrays.items()}
+
+
+def flatten_tree(tree: Any) -> Arrays:
+    """Return the leaves of a pytree by name."""
+    import jax
+
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
+
+
+def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
+    """Return a pytree of the template's form with stored leaves.
+
+    Args:
+        template: a pytree of arrays, or of their shapes and types.
+        arrays: leaves by name, as `flatten_tree` gives them.
+        where: the file or folder that an error names.
+
+    Raises:
+        DelayRLError: a leaf is missing, left over, or of another shape or type.
+    """
+    import jax
+
+    leaves, form = jax.tree_util.tree_flatten_with_path(template)
+    expected = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    for name in sorted(expected.keys() ^ arrays.keys()):
+        verb = "lacks" if name in expected else "has"
+        raise DelayRLError(f"{where} belongs to another agent or configuration: it {verb} {name}")
+    for name, leaf in expected.items():
+        if tuple(leaf.shape) != arrays[name].shape or np.dtype(leaf.dtype) != arrays[name].dtype:
+            raise DelayRLError(
+                f"{where} belongs to another agent or configuration: {name} is {arrays[name].dtype}"
+                f"{list(arrays[name].shape)}, expected {leaf.dtype}{list(leaf.shape)}"
+            )
+    return jax.tree_util.tree_unflatten(form, [arrays[name] for name in expected])

@@ -1,0 +1,60 @@
+"""A cell: the seeds of one condition that are trained together; and how far it is."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Self
+
+from delayrl.errors import DelayRLError
+from delayrl.run.condition import Condition
+
+State = Literal["todo", "running", "done", "failed"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One lockstep group of seeds of one condition. `id` is the hash of all of it."""
+
+    condition: Condition
+    seeds: tuple[int, ...]
+    id: str
+
+    @property
+    def folder(self) -> str:
+        """The name of its folder: readable, and unique."""
+        condition = self.condition
+        return re.sub(r"[^\w.-]+", "-", f"{condition.env}-delay{condition.label}-{condition.agent}-{self.id}")
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """What is stored of it, its id aside."""
+        return self.condition.json | {"seeds": list(self.seeds)}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], id: str) -> Self:
+        """Make a cell of stored values. Raises DelayRLError if one is missing or of another type."""
+        seeds = values.get("seeds")
+        if not isinstance(seeds, list):
+            raise DelayRLError("no good seeds")
+        return cls(Condition.from_json(values), tuple(seeds), id)
+
+    def __str__(self) -> str:
+        first, last = self.seeds[0], self.seeds[-1]
+        seeds = f"seed {first}" if first == last else f"seeds {first}-{last}"
+        return f"{self.condition}, {seeds}"
+
+
+class Progress(NamedTuple):
+    """How far a cell is.
+
+    Attributes:
+        state: in one word.
+        step: environment steps that each seed has stored, or is known to have taken.
+        speed: steps per second, where it is known.
+        line: the first line of a failure; who works on a running cell.
+    """
+
+    state: State
+    step: int
+    speed: float | None = None
+    line: str = ""

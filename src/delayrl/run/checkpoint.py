@@ -1,0 +1,70 @@
+"""Checkpoints of a run folder: their manifests, and whether their files are whole. No JAX.
+
+`checkpoints/STEP/manifest.json` holds the step, whether the run is complete, and the SHA-256 of each file of the
+checkpoint and of each piece of the replay that it needs.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from delayrl.errors import DelayRLError
+from delayrl.run.arrays import Arrays, load_arrays
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint, as its manifest describes it.
+
+    Attributes:
+        path: its folder.
+        step: the environment steps of each seed that it holds.
+        complete: whether it is the last of a finished run.
+        files: checksums of its own files.
+        pieces: checksums of the files in replay/ that it needs.
+    """
+
+    path: Path
+    step: int
+    complete: bool
+    files: dict[str, str]
+    pieces: dict[str, str]
+
+    def arrays(self, name: str) -> Arrays:
+        """Read one of its files: "agent" or "loop"."""
+        return load_arrays(self.path / f"{name}.safetensors")
+
+    def check(self) -> None:
+        """Raise DelayRLError if a file that it names is cut or changed."""
+        replay = self.path.parents[1] / "replay"
+        for name, checksum in (self.files | self.pieces).items():
+            file = (replay if name in self.pieces else self.path) / name
+            if Path(name).name != name or _checksum(file) != checksum:
+                raise DelayRLError(f"{name} is cut or changed")
+
+
+def checkpoint_folders(run: Path) -> list[Path]:
+    """Return the folders of a run's checkpoints, newest first."""
+    return sorted((run / "checkpoints").glob("[0-9]*"), reverse=True)
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint's manifest. Raises DelayRLError if it is missing or damaged."""
+    try:
+        manifest = json.loads((path / "manifest.json").read_text())
+        step, complete = int(manifest["step"]), bool(manifest["complete"])
+        files, pieces = dict(manifest["files"]), dict(manifest["pieces"])
+    except OSError as error:
+        raise DelayRLError(str(error)) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DelayRLError("its manifest is damaged") from error
+    needed = {"agent.safetensors"} if complete else {"agent.safetensors", "loop.safetensors"}
+    if step != int(path.name) or not needed <= files.keys():
+        raise DelayRLError("its manifest is damaged")
+    return Checkpoint(path, step, complete, files, pieces)
+
+
+def _checksum(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

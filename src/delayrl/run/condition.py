@@ -1,0 +1,150 @@
+"""What decides a result but the seed, resolved once from what the user gave."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+from delayrl.agents.base import Agent, Schedule
+from delayrl.agents.registry import find_agent
+from delayrl.core.protocol import Protocol
+from delayrl.core.types import Spec
+from delayrl.delays import Channel, Delay, DelayLaw, as_delay, short_label
+from delayrl.envs import delay_of
+from delayrl.errors import DelayRLError
+from delayrl.run.configuration import check_names, override, values_of
+
+KINDS: dict[str, Any] = {
+    "agent": str,
+    "env": str,
+    "delay": int | str,
+    "preset": str,
+    "protocol": str,
+    "overrides": dict,
+    "steps": int,
+}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One agent with its hyperparameters, on one task, under one delay and one protocol.
+
+    Attributes:
+        agent: its name in the registry.
+        env: the id of the task.
+        delay: environment steps, or a delay's text.
+        preset, protocol: their names.
+        overrides: hyperparameters and schedule options that differ from the preset's.
+        steps: environment steps that each seed trains; 0 where that is unknown.
+    """
+
+    agent: str
+    env: str
+    delay: int | str
+    preset: str = "paper"
+    protocol: str = "corrected"
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    steps: int = 0
+
+    @property
+    def label(self) -> int | str:
+        """The delay as rows name it: long lists of numbers are shortened."""
+        return short_label(self.delay)
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """What every row says of its condition."""
+        own = {name: getattr(self, name) for name in ("agent", "env", "delay", "preset", "protocol")}
+        return own | {"delay": self.label}
+
+    @property
+    def json(self) -> dict[str, Any]:
+        """All fields, as a cell's file and a table of results hold them."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Make a condition of stored values. Raises DelayRLError if one is missing or of another type."""
+        wrong = [name for name, kind in KINDS.items() if not isinstance(values.get(name), kind)]
+        if wrong:
+            raise DelayRLError(f"no good {', '.join(wrong)}")
+        return cls(**{name: values[name] for name in KINDS})
+
+    def __str__(self) -> str:
+        return f"{self.agent} on {self.env}, delay {self.label}"
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A condition, and the objects that it stands for."""
+
+    condition: Condition
+    agent: Agent
+    schedule: Schedule
+    delay: Delay
+    protocol: Protocol
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The configuration that a run folder keeps: every option by name, defaults included."""
+        condition = self.condition
+        return {
+            "agent": condition.agent,
+            "preset": condition.preset,
+            "env": condition.env,
+            "delay": condition.delay,
+            "protocol": condition.protocol,
+            "privileged": self.agent.privileged,
+            "hyperparameters": values_of(self.agent),
+            "schedule": values_of(self.schedule),
+        }
+
+    def min_episode_steps(self, spec: Spec) -> int:
+        """Steps that must follow in an episode before one can be sampled, itself included (see `replay.append`)."""
+        return self.agent.ahead(spec) if self.protocol.last_starts == "dropped" else 1
+
+    def cell_id(self, seeds: Sequence[int]) -> str:
+        """Return the name of a group of seeds: a hash of the configuration, however the user wrote it."""
+        parts = {name: value for name, value in self.config.items() if name != "privileged"} | {"seeds": list(seeds)}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def resolve(
+    agent: str,
+    env: str,
+    delay: float | str | DelayLaw | Channel | Delay,
+    preset: str,
+    protocol: str,
+    overrides: Mapping[str, Any],
+) -> Setup:
+    """Resolve what a user gave into a condition and its objects.
+
+    Raises:
+        DelayRLError: an unknown agent, preset, protocol or option, a bad value, a bad delay.
+    """
+    registration = find_agent(agent)
+    if preset not in registration.presets:
+        raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(registration.presets)}")
+    base, chosen = registration.presets[preset], registration.protocol(protocol)
+    check_names(overrides, base.agent, base.schedule)
+    values = {**chosen.overrides, **overrides}
+    schedule = override(base.schedule, values)
+    parsed = delay_of(env, delay)
+    text = parsed.plain()
+    if not isinstance(delay, int | float | str) and as_delay(text) != parsed:
+        raise DelayRLError(
+            f"a run keeps its delay as text, and {str(parsed)[:60]!r} cannot be read back: use delayrl.delays"
+        )
+    condition = Condition(agent, env, text, preset, protocol, dict(overrides), schedule.steps)
+    return Setup(condition, override(base.agent, values), schedule, parsed, chosen)
+
+
+def agent_of(config: Mapping[str, Any]) -> Agent:
+    """Make the agent that a run's configuration describes. Raises DelayRLError for an unknown name."""
+    try:
+        agent = find_agent(config["agent"]).presets[config["preset"]].agent
+    except (KeyError, DelayRLError) as error:
+        raise DelayRLError(f"the run's configuration names an unknown agent or preset: {error}") from error
+    check_names(config["hyperparameters"], agent)
+    return override(agent, config["hyperparameters"])  # type: ignore[no-any-return]

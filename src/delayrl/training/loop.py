@@ -1,0 +1,157 @@
+"""The loop: act, store, learn, evaluate, save. No algorithm's name is in it.
+
+Everything random is a function of (seed, step), so a checkpoint needs no generator's state. The next actions are
+chosen before the update that follows a step: the device learns while the environments simulate.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from delayrl.core.types import Metrics
+from delayrl.errors import DelayRLError, StoppedError
+from delayrl.play.evaluation import RANDOM_ACTIONS
+from delayrl.play.plots import curve
+from delayrl.training.actor import Actor
+from delayrl.training.estimate import estimate
+from delayrl.training.learner import Stored
+from delayrl.training.recorder import Recorder
+from delayrl.training.resume import save
+from delayrl.training.signals import stop_signal
+from delayrl.training.state import Group, TrainState
+
+METRICS_EVERY = 1000
+
+
+def run(
+    group: Group, state: TrainState, note: Callable[[str], None], *, progress: bool = False, track: str | None = None
+) -> None:
+    """Train from a state to the end, and draw the learning curves.
+
+    Args:
+        group: what is trained.
+        state: where it stands; it is used up.
+        note: takes lines for people.
+        progress: whether to show a progress bar and an estimate of the time.
+        track: a service that gets the scalars too, or None.
+
+    Raises:
+        StoppedError: the process was asked to stop; the newest step is stored.
+        DelayRLError: NaN, a full disk, episodes too short to learn from.
+    """
+    steps = group.setup.schedule.steps
+    if state.step < steps:
+        recorder = Recorder(group, state.learner.agent, state.actors[0].env, track)
+        if progress:
+            note(f"estimate: {estimate(group, state)}")
+        bar = tqdm(
+            total=steps,
+            initial=state.step,
+            unit="step",
+            disable=not progress,
+            smoothing=0.05,
+            dynamic_ncols=True,
+            mininterval=0.5 if sys.stderr.isatty() else 30,
+        )
+        with stop_signal() as stop, bar:
+            Loop(group, state, recorder).train(stop.is_set, bar)
+    for folder in group.runs:
+        curve(folder.read("rows"), folder.path / "curve.png")
+
+
+class Loop:
+    """Trains a group of seeds in lockstep, step by step."""
+
+    def __init__(self, group: Group, state: TrainState, recorder: Recorder) -> None:
+        self.group, self.state, self._recorder = group, state, recorder
+        self._metrics: Metrics = {}
+        self._learning = False
+
+    def train(self, stopped: Callable[[], bool], bar: Any) -> None:
+        """Train until the last step, or until `stopped()`."""
+        schedule, state = self.group.setup.schedule, self.state
+        began, began_step = time.perf_counter(), state.step
+        while state.step < schedule.steps:
+            if stopped():
+                self.state = save(self.group, state)
+                raise StoppedError(f"stopped at step {state.step:,}; the same command goes on from there")
+            self.step()
+            bar.update(1)
+            if state.step % METRICS_EVERY == 0:
+                speed = (state.step - began_step) / (time.perf_counter() - began)
+                self._recorder.log(state.step, self._metrics, speed)
+            if state.step % schedule.evaluate_every == 0 or state.step == schedule.steps:
+                self.choose()  # before learning, as at every other step
+                self.learn()  # what is evaluated has learned from every step before
+                bar.set_postfix_str(self._recorder.evaluate(state.step, state.learner.agent))
+                self.state = state = save(self.group, state, complete=state.step == schedule.steps)
+
+    def step(self) -> None:
+        """Act once in every environment, and learn from the steps before if a block of them is full."""
+        state = self.state
+        actions = self.choose()
+        if len(state.pending) == self.group.setup.schedule.updates_per_call:
+            self.learn()
+        actions, state.actions = np.asarray(actions), None
+        transitions = self.group.apply(Actor.step, state.actors, actions)
+        state.pending.append(
+            [
+                Stored(transition, self._hidden(actor))
+                for transition, actor in zip(transitions, state.actors, strict=True)
+            ]
+        )
+        state.step += 1
+
+    def choose(self) -> Any:
+        """Return the next actions, chosen by what was learned until now. Does not wait for them."""
+        state, group = self.state, self.group
+        if state.actions is None:
+            state.actions = self._random_actions() if state.step < group.setup.schedule.random_steps else self._act()
+        return state.actions
+
+    def learn(self) -> None:
+        """Give the newest steps to the learner, which learns what is due. Does not wait for it."""
+        group, state = self.group, self.state
+        if not state.pending:
+            return
+        state.learner, metrics, learned = group.program.learn(
+            state.learner, state.pending, group.keys, state.step, group.setup.schedule.random_steps
+        )
+        state.pending = []
+        self._metrics |= metrics
+        if learned and not self._learning:
+            self._learning = True
+            if int(state.learner.replay.steps.min()) < group.spec.delay + 1:  # the first block's own steps count too
+                env = group.setup.condition.env
+                raise DelayRLError(f"no episode of {env} is long enough to learn from under this protocol")
+
+    def _act(self) -> Any:
+        group, state = self.group, self.state
+        seen = jax.tree.map(lambda *x: np.stack(x), *[actor.seen for actor in state.actors])
+        actions = group.program.act(state.learner.agent, seen, group.keys, state.step)
+        if group.setup.protocol.first_action == "random" and group.spec.delay:
+            first = np.array([[not actor.actions] for actor in state.actors])
+            return np.where(first, self._random_actions(), actions)
+        return actions
+
+    def _random_actions(self) -> NDArray[np.float32]:
+        generators = [np.random.default_rng([seed, RANDOM_ACTIONS, self.state.step]) for seed in self.group.seeds]
+        size = self.group.spec.action_size
+        return np.stack([generator.uniform(-1, 1, size).astype(np.float32) for generator in generators])
+
+    def _hidden(self, actor: Actor) -> np.int32:
+        """How many of the newest steps a seed's learner may not use, because not all of them have arrived.
+
+        What is older than the longest delay has arrived, even if it was overtaken.
+        """
+        if actor.privileged:
+            return np.int32(0)
+        delay = self.group.setup.delay
+        longest = delay.action.maximum + max(delay.observation.maximum, delay.reward.maximum)
+        return np.int32(min(len(actor.actions), longest))

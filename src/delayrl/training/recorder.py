@@ -1,0 +1,88 @@
+"""Evaluation and metrics of a run in training, written to its run folders."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from delayrl.agents.base import State
+from delayrl.core.types import Metrics, Spec
+from delayrl.envs import physics
+from delayrl.errors import DelayRLError
+from delayrl.play.evaluation import EVALUATION, Evaluator, reset_seed
+from delayrl.training.resume import KEPT
+from delayrl.training.state import Group
+from delayrl.training.tracking import Tracker
+
+
+class Recorder:
+    """Evaluates a group of seeds and writes rows and metrics.
+
+    Args:
+        group: what is trained.
+        agent: its state, of which only the structure matters here.
+        env: the environment that the rows' physics is read from.
+        track: a service that gets the scalars too, or None.
+    """
+
+    def __init__(self, group: Group, agent: State, env: Any, track: str | None) -> None:
+        self._group = group
+        setup = group.setup
+        self._columns = setup.condition.columns | {"privileged": setup.agent.privileged}
+        self._physics = physics(env)
+        self._trackers = [Tracker(track, run.path) for run in group.runs]
+        name, delay = setup.condition.env, setup.delay
+        shape = (len(group.seeds), setup.schedule.evaluation_episodes, group.apply)
+        self._evaluators = {"agent": Evaluator(setup.agent, group.spec, name, delay, *shape)}
+        if reference := setup.agent.reference_policy(agent):
+            spec = Spec(group.spec.obs_size, group.spec.action_size, 0)
+            self._evaluators["reference"] = Evaluator(reference[0], spec, name, 0, *shape)
+
+    def evaluate(self, step: int, agent: State) -> str:
+        """Play the evaluation episodes of a step, write a row for each. Returns the mean returns in words."""
+        group, protocol = self._group, self._group.setup.protocol
+        states = {"agent": agent}
+        if reference := group.setup.agent.reference_policy(agent):
+            states["reference"] = reference[1]
+        episodes = range(group.setup.schedule.evaluation_episodes)
+        own = [[reset_seed(seed, EVALUATION, step, episode) for episode in episodes] for seed in group.seeds]
+        resets = [[seed] * len(episodes) for seed in group.seeds] if protocol.start_states == "same" else own
+        first = None
+        if protocol.first_action == "random" and group.spec.delay:
+            size = group.spec.action_size
+            first = np.array([[np.random.default_rng(n).uniform(-1, 1, size) for n in row] for row in own], np.float32)
+        keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(group.keys)
+        summary = []
+        for policy, evaluator in self._evaluators.items():
+            played = evaluator(states[policy], resets, keys, first if policy == "agent" else None, own)
+            summary.append(f"{policy} {played.returns.mean():.4g}")
+            for i, (run, tracker) in enumerate(zip(group.runs, self._trackers, strict=True)):
+                rows = [
+                    {
+                        **self._columns,
+                        "seed": group.seeds[i],
+                        "step": step,
+                        "policy": policy,
+                        "episode": episode,
+                        "reset_seed": resets[i][episode],
+                        "return": float(played.returns[i, episode]),
+                        "length": int(played.lengths[i, episode]),
+                        **self._physics,
+                    }
+                    for episode in episodes
+                ]
+                run.append("rows", rows)
+                tracker.write(step, {f"return/{policy}": float(played.returns[i].mean())})
+        return " · ".join(summary)
+
+    def log(self, step: int, metrics: Metrics, steps_per_second: float) -> None:
+        """Write the newest metrics of each seed. Raises DelayRLError for one that is not finite."""
+        values = jax.device_get(metrics)
+        for i, (run, tracker) in enumerate(zip(self._group.runs, self._trackers, strict=True)):
+            own = {name: float(x[i]) for name, x in values.items()}
+            for name, x in own.items():
+                if not np.isfinite(x):
+                    seed = self._group.seeds[i]
+                    raise DelayRLError(f"{name} is {x} at step {step} of seed {seed}: training diverged; {KEPT}")
+            run.append("metrics", [{"step": step, "steps_per_second": round(steps_per_second, 2), **own}])
+            tracker.write(step, own | {"steps_per_second": steps_per_second})

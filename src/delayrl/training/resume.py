@@ -1,0 +1,221 @@
+"""Starting, saving and resuming: run folders on one side, a `TrainState` on the other."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from delayrl.agents.base import Schedule
+from delayrl.core import replay as ring
+from delayrl.core.types import Transition
+from delayrl.errors import DelayRLError
+from delayrl.run.arrays import Arrays, flatten_tree, load_arrays, restore_tree
+from delayrl.run.checkpoint import Checkpoint
+from delayrl.run.configuration import values_of
+from delayrl.run.folder import Run
+from delayrl.run.provenance import versions
+from delayrl.training.actor import Actor
+from delayrl.training.learner import Stored
+from delayrl.training.state import Group, TrainState
+
+COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
+"""The columns of a replay that have one entry for each row."""
+COUNTS = ("rows", "steps", "lost")
+KEPT = "the last good checkpoint is kept"
+
+
+def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
+    """Create the run folders, or resume from what they hold.
+
+    Args:
+        group: what is trained.
+        actors: of each seed, at the start of the first episode.
+        overwrite: whether to delete runs that are there.
+        note: takes lines for people.
+
+    Raises:
+        DelayRLError: another run or other files in a folder, no common checkpoint, a damaged one.
+    """
+    runs, config = group.runs, group.setup.config
+    replaced = [run for run in runs if overwrite and run.exists and run.config]
+    for run in replaced:
+        run.remove()
+    for run, seed in zip(runs, group.seeds, strict=True):
+        if run.exists:
+            _check_same(run, config | {"seed": seed})
+        elif run not in replaced and not run.is_free:
+            raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
+    checkpoints = _common_checkpoints(runs, note)
+    for run, seed in zip(runs, group.seeds, strict=True):
+        if not run.exists:
+            run.create(config | {"seed": seed, "versions": versions()})
+    learner = group.program.init(group.keys, group.setup.schedule.replay_capacity)
+    state = TrainState(0, learner, actors, [], None, [{} for _ in runs], [(0, 0) for _ in runs])
+    if not checkpoints:
+        for run in runs:
+            run.rewind(-1)
+        return state
+    newest = checkpoints[0]
+    note(f"{'found complete' if newest.complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
+    state = restore(group, state, checkpoints)
+    for run in runs:
+        run.rewind(newest.step)
+        if newest.complete:
+            run.finish()
+    return state
+
+
+def _common_checkpoints(runs: list[Run], note: Callable[[str], None]) -> list[Checkpoint]:
+    """Return the newest checkpoint that all seeds have, for each; an empty list where a run begins."""
+    good, broken = zip(*(run.checkpoints() for run in runs), strict=True)
+    for line in (line for lines in broken for line in lines):
+        note(line)
+    if any(good) and not all(good):
+        behind = ", ".join(str(run.path) for run, own in zip(runs, good, strict=True) if not own)
+        if any(len(own) > 1 or (own and own[0].complete) for own in good):
+            raise DelayRLError(f"{behind} cannot go on beside the other seeds; train those seeds alone")
+    common = set.intersection(*({checkpoint.step for checkpoint in own} for own in good))
+    if common:
+        return [next(checkpoint for checkpoint in own if checkpoint.step == max(common)) for own in good]
+    for run, lines in zip(runs, broken, strict=True):
+        if lines:
+            raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
+    return []
+
+
+def _check_same(run: Run, wanted: dict[str, Any]) -> None:
+    """Raise DelayRLError if a folder holds a run with another configuration."""
+    stored = run.config
+    added_later = values_of(Schedule())  # options that an older configuration does not mention had these values
+    for key, value in wanted.items():
+        if isinstance(value, dict):
+            known = added_later | stored[key] if key == "schedule" else stored[key]
+            changed = [name for name in value if known.get(name) != value[name]]
+        else:
+            changed = [key] if stored.get(key) != value else []
+        if changed:
+            raise DelayRLError(
+                f"{run.path} holds a run with another {', '.join(changed)}; give another --out, or --overwrite"
+            )
+
+
+def restore(group: Group, fresh: TrainState, checkpoints: list[Checkpoint]) -> TrainState:
+    """Return the state that the seeds' checkpoints hold, with the arrays and environments of a fresh one.
+
+    Raises:
+        DelayRLError: a file of another agent, a damaged file, an environment that does not repeat an episode.
+    """
+    states = [restore_tree(group.template, c.arrays("agent"), c.path) for c in checkpoints]
+    agent = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
+    step = checkpoints[0].step
+    if checkpoints[0].complete:
+        return replace(fresh, step=step, learner=fresh.learner._replace(agent=agent))
+    loops = [checkpoint.arrays("loop") for checkpoint in checkpoints]
+    replays = []
+    for i, (run, checkpoint, loop) in enumerate(zip(group.runs, checkpoints, loops, strict=True)):
+        columns = {name: np.array(column[i]) for name, column in fresh.learner.replay._asdict().items()}
+        for piece in sorted(checkpoint.pieces):
+            _paste(columns, load_arrays(run.path / "replay" / piece))
+        replays.append(ring.Replay(**(columns | {name: loop[name] for name in COUNTS})))  # type: ignore[arg-type]
+        actor = fresh.actors[i]
+        actor.replay_episode(int(loop["episode"]), loop["actions"])
+        if not np.array_equal(actor.truth, loop["truth"]):
+            env = group.setup.condition.env
+            raise DelayRLError(f"{env} does not repeat an episode from its seed, so the run cannot be resumed")
+    replay = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays)
+    pending = [_pending(loop) for loop in loops]
+    return TrainState(
+        step,
+        fresh.learner._replace(agent=agent, replay=replay),
+        fresh.actors,
+        [list(seeds) for seeds in zip(*pending, strict=True)],
+        np.stack([loop["chosen"] for loop in loops]) if "chosen" in loops[0] else None,
+        [dict(checkpoint.pieces) for checkpoint in checkpoints],
+        [(int(loop["rows"]), int(loop["steps"])) for loop in loops],
+    )
+
+
+def _pending(loop: Arrays) -> list[Stored]:
+    """Return the steps of one seed that its learner had not been given."""
+    if "hidden" not in loop:
+        return []
+    columns = [loop[f"pending.{name}"] for name in Transition._fields]
+    steps = zip(*columns, loop["hidden"], strict=True)
+    return [Stored(Transition(*values), hidden) for *values, hidden in steps]
+
+
+def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainState:
+    """Write a checkpoint of each seed, of its replay only what is new. Returns the state with what is stored.
+
+    Raises:
+        DelayRLError: weights that are not finite, a full disk.
+    """
+    if state.step == 0:
+        return state
+    agent = jax.device_get(state.learner.agent)
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(agent) if np.issubdtype(x.dtype, np.floating)):
+        raise DelayRLError(f"weights are not finite at step {state.step}: training diverged; {KEPT}")
+    pieces, stored = [], []
+    for i, run in enumerate(group.runs):
+        weights = flatten_tree(jax.tree.map(lambda x, i=i: x[i], agent))
+        if complete:
+            run.save(state.step, weights, None, {}, complete=True)
+            continue
+        own, until = _save_replay(run, state, i, group.setup.schedule.replay_capacity)
+        run.save(state.step, weights, _loop_arrays(group, state, i), own)
+        run.drop_pieces()
+        pieces.append(own)
+        stored.append(until)
+    for run in group.runs if complete else []:  # once all seeds have their last checkpoint
+        run.finish()
+    return state if complete else replace(state, pieces=pieces, stored=stored)
+
+
+def _save_replay(run: Run, state: TrainState, seed: int, capacity: int) -> tuple[dict[str, str], tuple[int, int]]:
+    """Write what is new in one seed's replay. Returns the pieces that hold all of it, and up to where."""
+    replay = state.learner.replay
+    rows, steps = int(replay.rows[seed]), int(replay.steps[seed])
+    known_rows, known_steps = state.stored[seed]
+    first = max(known_rows, rows - capacity + 1, 0)
+    name = f"{first:012d}-{rows:012d}.safetensors"
+    pieces = state.pieces[seed] | {name: run.save_piece(name, _cut(replay, seed, first, rows, known_steps, steps))}
+    needed = {name: checksum for name, checksum in pieces.items() if int(name[13:25]) > rows - capacity}
+    return needed, (rows, steps)
+
+
+def _loop_arrays(group: Group, state: TrainState, seed: int) -> Arrays:
+    """What a resumed run of one seed needs besides its agent and replay."""
+    actor, replay = state.actors[seed], state.learner.replay
+    arrays: Arrays = {}
+    if state.pending:  # where a run was stopped
+        steps = [seeds[seed] for seeds in state.pending]
+        transitions = jax.tree.map(lambda *x: np.stack(x), *(step.transition for step in steps))
+        arrays = {f"pending.{name}": x for name, x in transitions._asdict().items()}
+        arrays["hidden"] = np.stack([step.hidden for step in steps])
+    if state.actions is not None:
+        arrays["chosen"] = np.asarray(state.actions)[seed]
+    counts = {name: int(getattr(replay, name)[seed]) for name in COUNTS} | {"episode": actor.episode}
+    arrays |= {name: np.asarray(count, np.int32) for name, count in counts.items()}
+    actions = np.reshape(actor.actions, (-1, group.spec.action_size))
+    return arrays | {"truth": actor.truth, "actions": actions}
+
+
+def _cut(replay: ring.Replay, seed: int, first: int, last: int, first_step: int, steps: int) -> Arrays:
+    """Return rows first..last of one seed's ring, and the rows of its steps from `first_step` on."""
+    capacity = replay.obs.shape[1]
+    index = np.arange(first, last + 1) % capacity
+    piece: Arrays = {name: np.asarray(getattr(replay, name)[seed, index]) for name in COLUMNS}
+    numbers = np.arange(max(first_step, steps - capacity), steps)
+    row_of = np.asarray(replay.row_of[seed, numbers % capacity])
+    return piece | {"rows": np.arange(first, last + 1), "steps": numbers, "row_of": row_of}
+
+
+def _paste(columns: Arrays, piece: Arrays) -> None:
+    """Put a piece back where `_cut` took it from."""
+    capacity = len(columns["obs"])
+    for name in COLUMNS:
+        columns[name][piece["rows"] % capacity] = piece[name]
+    columns["row_of"][piece["steps"] % capacity] = piece["row_of"]
