@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "udp_demo"))
 from link import Link, Travelling
 from policies import RunPolicy
 
-from delayrl.deploy import Controller, Policy
+from delayrl.deploy import Controller, ControlPolicy
 from delayrl.run.provenance import versions
 
 LINKS = [Link(4, 6), Link(4, 7), Link(3, 8), Link(4, 8), Link(3, 5, loss=0.4), Link(6, 6)]
@@ -27,7 +27,7 @@ EPISODES = 10
 class Last:
     """Shows a policy the newest Δ actions, however old the observation is."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: ControlPolicy) -> None:
         self._policy = policy
         self.obs_size, self.action_size, self.dt = policy.obs_size, policy.action_size, policy.dt
         self.low, self.high, self.max_age = policy.low, policy.high, 64
@@ -40,7 +40,7 @@ class Last:
         return self._policy(obs, actions[age - longest : age], longest)
 
 
-def returns(env: gym.Env[Any, Any], policy: Policy, link: Link, on_overrun: str) -> list[float]:
+def returns(env: gym.Env[Any, Any], policy: ControlPolicy, link: Link, on_overrun: str) -> list[float]:
     """Of `EPISODES` episodes, each with its own start state and network."""
     controller = Controller(policy, on_overrun=on_overrun)
     totals = []

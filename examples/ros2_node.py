@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.deploy import Controller, OverrunError, Policy
+from delayrl.deploy import Controller, ControlPolicy, OverrunError
 from delayrl.errors import DelayRLError
 
 REPORT_EVERY = 10.0  # seconds
 
 
-def make_node(policy: Policy, **settings: Any) -> Any:
+def make_node(policy: ControlPolicy, **settings: Any) -> Any:
     """The node; `settings` go to the controller: on_overrun, action_delay, dt, idle."""
     from rclpy.node import Node
     from rclpy.qos import qos_profile_sensor_data

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.deploy import Policy
+from delayrl.deploy import ControlPolicy
 from delayrl.errors import DelayRLError
 
 
@@ -78,7 +78,7 @@ class Predictor:
 class Blind:
     """A policy that takes every observation for current: of VDPO it is the reference, which learned without delay."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: ControlPolicy) -> None:
         self._policy = policy
         self.obs_size, self.action_size, self.dt = policy.obs_size, policy.action_size, policy.dt
         self.low, self.high, self.max_age = policy.low, policy.high, 64
@@ -89,13 +89,13 @@ class Blind:
         return self._policy(obs, self._nothing, 0)
 
 
-def load(source: str, blind: bool = False) -> Policy:
+def load(source: str, blind: bool = False) -> ControlPolicy:
     """A policy by its source: a run folder, a bundle (`delayrl export`), or "predictor".
 
     Raises:
         DelayRLError: nothing of this kind is there.
     """
-    policy: Policy
+    policy: ControlPolicy
     if source == "predictor":
         policy = Predictor()
     elif (Path(source) / "checkpoints").is_dir():

@@ -1,6 +1,7 @@
-"""From a run to a robot: bundles of a policy, what runs them, and what keeps the history right around them.
+"""From a run to a robot: policy bundles, the backends that compute them, and the controller that keeps the history.
 
-Nothing here imports JAX until a run is exported. `load_bundle` needs NumPy and safetensors, `Controller` NumPy alone.
+Importing this package does not import JAX; only `export_run` and the backend `jax` do. `load_bundle` needs NumPy and
+safetensors, `Controller` NumPy alone.
 """
 
 from importlib import import_module
@@ -10,26 +11,26 @@ if TYPE_CHECKING:
     from delayrl.deploy.bundle import Bundle as Bundle
     from delayrl.deploy.bundle import load_bundle as load_bundle
     from delayrl.deploy.export import export_run as export_run
-    from delayrl.deploy.runtime.controller import ClockError as ClockError
+    from delayrl.deploy.runtime.clock import ClockError as ClockError
     from delayrl.deploy.runtime.controller import Controller as Controller
+    from delayrl.deploy.runtime.controller import ControlPolicy as ControlPolicy
     from delayrl.deploy.runtime.controller import OverrunError as OverrunError
-    from delayrl.deploy.runtime.controller import Policy as Policy
-    from delayrl.deploy.runtime.statistics import Statistics as Statistics
+    from delayrl.deploy.runtime.telemetry import Statistics as Statistics
 
-_HOME = {
+_MODULES = {
     "Bundle": "bundle",
-    "ClockError": "runtime.controller",
+    "ClockError": "runtime.clock",
+    "ControlPolicy": "runtime.controller",
     "Controller": "runtime.controller",
     "OverrunError": "runtime.controller",
-    "Policy": "runtime.controller",
-    "Statistics": "runtime.statistics",
+    "Statistics": "runtime.telemetry",
     "export_run": "export",
     "load_bundle": "bundle",
 }
-__all__ = sorted(_HOME)
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(import_module(f"delayrl.deploy.{_HOME[name]}"), name)
+    if name in _MODULES:
+        return getattr(import_module(f"delayrl.deploy.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'delayrl.deploy' has no attribute {name!r}")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from delayrl.deploy.backends.network import Act, Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
-from delayrl.deploy.runtime.controller import LONGEST, SHORTEST
+from delayrl.deploy.runtime.clock import LONGEST_STEP, SHORTEST_STEP
 from delayrl.errors import DelayRLError
 
 BACKENDS = ("numpy", "onnx", "jax")
@@ -36,7 +36,7 @@ class Bundle:
         self.low, self.high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
         self.min_age, self.max_age = 0, network.max_age
         dt: Any = metadata.get("dt")
-        self.dt = float(dt) if type(dt) in (int, float) and SHORTEST <= dt <= LONGEST else None
+        self.dt = float(dt) if type(dt) in (int, float) and SHORTEST_STEP <= dt <= LONGEST_STEP else None
         lag: Any = metadata.get("action_delay")
         self.action_delay = lag if type(lag) is int and 0 <= lag <= network.max_age else 0
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from delayrl.deploy import ClockError, Controller, OverrunError
-from delayrl.deploy.runtime.controller import KEPT
+from delayrl.deploy.runtime.controller import EXTRA_STEPS
 from delayrl.errors import DelayRLError
 
 DT = 1 / 16
@@ -257,7 +257,7 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
                 assert len(policy.calls) == asked, "the policy was asked for nothing"
                 continue
             age, content, since, past = wanted
-            remembered = age <= setting.max_age + setting.action_delay + KEPT
+            remembered = age <= setting.max_age + setting.action_delay + EXTRA_STEPS
             exact = exact and remembered
             happened[f"age {min(age, 9)}"] = happened.get(f"age {min(age, 9)}", 0) + 1
             if len(policy.calls) > asked:

@@ -1,1 +1,1 @@
-"""What keeps the history of actions right around a policy."""
+"""The controller around a policy: its clock, the history of actions, and its telemetry."""

@@ -1,65 +1,71 @@
-"""The runtime of a delayed policy: it keeps the history right. NumPy alone, no JAX.
+"""Run a policy on a plant whose observations arrive late. Needs NumPy alone, no JAX.
 
-A policy that acts on late observations needs three things that agree: the newest observation that has arrived, its age,
-and the actions that the plant was given since. `Controller` owns all three, and shows its policy what
-`delayrl.wrappers.Delayed` would, whatever the network does to the observations.
+Such a policy takes three things that must agree: the newest observation that has arrived, its age, and the actions
+that the plant was given since. `Controller` keeps all three. It shows its policy what `delayrl.wrappers.Delayed` would
+show, whatever the network does to the observations.
 
-Time is a list of *steps*, one for each control period; each holds the action that the plant was given in it. s_k is the
-state when k steps were over. When the action of step n is chosen, the age of s_k is n - k, and the actions of the steps
-k..n-1 are those since. The age counts entries of this list; it is never computed from elapsed time.
+Time is a list of *steps*, one for each control period. Each holds the action that the plant was given in it. s_k is the
+state after k steps. When the action of step n is chosen, the age of s_k is n - k, and the actions of the steps k..n-1
+are those since. The age counts entries of this list; it is never computed from elapsed time.
 
-`stamps="steps"`: the stamp of an observation is k. No clock is read: for tests, and for simulators that wait.
+With `stamps="steps"`, the stamp of an observation is k. No clock is read. Use it for tests, and for simulators that
+wait.
 
-`stamps="seconds"`: the stamp is when the observation was made, on the clock that `now` is read from. With a period dt:
-  - A command g seconds after the newest step began counts as m = ⌊g/dt + ½⌋ steps. The rule is m = 1, however uneven
-    the period. m > 1: the plant went on for m - 1 steps without a command; they are in the history, dt apart. m = 0:
-    the command before was hardly carried out; the new one takes its place.
-  - An observation belongs to the step whose beginning is nearest to its stamp; halfway counts as the later one. None
-    is younger than `now`.
-  - Step 0 begins with the episode: at `reset`, or without one with the first observation or command. The steps before
-    the first command, by the same rounding, had none: so a first observation that comes late is as old as it is.
+With `stamps="seconds"`, the stamp is the time when the observation was made, on the clock that `now` is read from. With
+a period dt:
+  - A command g seconds after the newest step began counts as m = ⌊g/dt + ½⌋ steps. Usually m = 1, however uneven the
+    period. If m > 1, the plant went on for m - 1 steps without a command; they enter the history, dt apart. If m = 0,
+    the command before was hardly carried out; the new one replaces it.
+  - An observation belongs to the step whose beginning is nearest to its stamp, and to the later of two that are equally
+    near. No observation is younger than `now`.
+  - Step 0 begins with the episode: at `reset`, or without a reset at the first observation or command. The steps before
+    the first command, by the same rounding, had no command. So the first observation has its true age, even if it
+    arrives late.
 
 A command that takes effect κ steps after it was given (`action_delay`) has its step begin κ·dt later. So commands in
 flight are in the history, and an observation that is made now has the age κ.
 """
 
-import math
 import operator
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from delayrl.deploy.runtime.clock import Clock, Stamps
+from delayrl.deploy.runtime.episode import Arrival, Episode
 from delayrl.deploy.runtime.history import Action, History
-from delayrl.deploy.runtime.statistics import Moments, Statistics
+from delayrl.deploy.runtime.telemetry import Statistics, Telemetry
 from delayrl.errors import DelayRLError
 
-Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
-"""What became of an observation: used, or why not."""
 OnOverrun = Literal["hold", "clip", "raise"]
-Stamps = Literal["steps", "seconds"]
+"""What `act` does while the newest observation is older than the policy's longest age Δ.
 
-KEPT = 64
-"""Steps that are remembered beyond Δ + κ. An older observation is an overrun anyway; its age is then an estimate."""
-SHORTEST, LONGEST = 1e-6, 1e6
-"""Seconds of a step."""
-FARTHEST = 1e15
-"""No time is farther from 0, in steps or seconds: beyond, floating point does not tell neighbours apart."""
+"hold" repeats the newest action of the history. "clip" shows the policy the observation at age Δ with the first Δ
+actions after it, an input that occurred in training; once these are forgotten, it holds. "raise" raises `OverrunError`
+and records nothing.
+"""
+
+EXTRA_STEPS = 64
+"""Steps that the history keeps beyond Δ + κ. An observation that is older is an overrun, and its age an estimate."""
 
 
 class OverrunError(DelayRLError):
     """The newest observation is older than any that the policy was trained for (`on_overrun="raise"`)."""
 
 
-class ClockError(DelayRLError):
-    """Time did not go forward."""
+class ControlPolicy(Protocol):
+    """A policy that a controller can run: a function with its sizes and ranges.
 
-
-class Policy(Protocol):
-    """What is run: sizes, the range of actions [A], the longest age Δ, and seconds a step (None where unknown)."""
+    Attributes:
+        obs_size, action_size: S and A.
+        low, high: the range of the actions, [A].
+        max_age: Δ, the longest age that it accepts, in steps.
+        dt: seconds a step; None if unknown.
+    """
 
     obs_size: int
     action_size: int
@@ -69,41 +75,36 @@ class Policy(Protocol):
     dt: float | None
 
     def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
-        """The action [A] for an observation [S] of this age and the actions [Δ, A] since, oldest first, then zeros."""
+        """Return the action [A] for an observation [S] of this age and the actions [Δ, A] since.
+
+        The actions are in order, oldest first; zeros follow the first `age` of them.
+        """
         ...
 
 
 class Controller:
-    """Runs a policy on a plant whose observations arrive late.
+    """Run a policy on a plant whose observations arrive late.
 
-    `observe` may be called from another thread than `act`; neither makes the other wait for the policy.
+    `observe` may be called from another thread than `act`, and does not wait for the policy.
 
     Args:
-        policy: see `Policy`. It is asked once here, so that what it compiles at its first call delays no action.
+        policy: is called once here, so that the time it takes to compile does not delay an action.
         stamps: "steps" or "seconds", the unit of every stamp and of `now`.
         dt: seconds a step, for stamps in seconds; None for the policy's own.
-        action_delay: steps from a command to its effect, κ. It is part of the age. None for the policy's own
-            `action_delay`, that of its training; 0 where it has none.
-        on_overrun: what `act` does while the newest observation is older than the policy's longest age Δ.
-            "hold": the newest action of the history, once more; the policy is not asked.
-            "clip": what the policy does at age Δ, for the observation and the first Δ actions after it: the right
-            action for an earlier moment, from an input that training has seen. As "hold" once these are forgotten.
-            "raise": `OverrunError`, and nothing is recorded.
-        idle: what the plant does in a step without a command, [A]; None if it goes on with the one before (before the
-            first: zeros, or what is nearest to them in range).
-        clock: where `now` comes from when it is left out and stamps are in seconds.
+        action_delay: steps from a command to its effect, κ, which is part of the age. None for the policy's own
+            `action_delay`, or 0 if it has none.
+        on_overrun: what `act` does while the newest observation is too old for the policy; see `OnOverrun`.
+        idle: what the plant does in a step without a command, [A]. None if it goes on with the action before, or with
+            zeros (clipped to the range) before the first.
+        clock: returns `now` where it is left out and stamps are in seconds.
 
     Raises:
         DelayRLError: arguments that do not fit each other.
     """
 
-    _obs: NDArray[np.float64] | None
-    _start: float
-    _first: int | None
-
     def __init__(
         self,
-        policy: Policy,
+        policy: ControlPolicy,
         *,
         stamps: Stamps = "steps",
         dt: float | None = None,
@@ -112,278 +113,190 @@ class Controller:
         idle: ArrayLike | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if stamps not in get_args(Stamps):
-            raise DelayRLError(f"stamps are in steps or in seconds; got {stamps!r}")
         if on_overrun not in get_args(OnOverrun):
             raise DelayRLError(f"on_overrun is hold, clip or raise; got {on_overrun!r}")
-        if action_delay is None:
-            action_delay = getattr(policy, "action_delay", 0)
-        if isinstance(action_delay, bool) or not isinstance(action_delay, int | np.integer) or action_delay < 0:
-            raise DelayRLError(f"action_delay counts whole steps; got {action_delay!r}")
-        if action_delay > policy.max_age:
-            raise DelayRLError(
-                f"an action delay of {action_delay} steps is itself above the policy's longest age, {policy.max_age}"
-            )
-        if stamps == "steps" and dt is not None:
-            raise DelayRLError("dt goes with stamps='seconds'; steps have no length")
-        if stamps == "seconds":
-            dt = policy.dt if dt is None else dt
-            if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not SHORTEST <= dt <= LONGEST:
-                allowed = f"{SHORTEST:g} .. {LONGEST:g}"
-                raise DelayRLError(f"stamps in seconds need the seconds of a step, {allowed}: give dt=…; got {dt!r}")
-        self.policy, self.stamps, self.on_overrun, self.action_delay = policy, stamps, on_overrun, int(action_delay)
-        self._period, self._clock = 1.0 if dt is None else float(dt), clock
-        self._idle = None if idle is None else self._action(idle, "idle")
-        self._acting, self._state = threading.Lock(), threading.Lock()  # always taken in this order
-        self._counts = dict.fromkeys([*get_args(Arrival), "decisions", "overruns", "overridden"], 0)
-        self._missed = self._replaced = 0  # of the episodes before
-        self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
-        self._episode = 0
-        self._begin(0.0 if stamps == "steps" else -math.inf)
+        self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
+        self.action_delay = _action_delay(policy, action_delay)
+        self._clock = Clock(stamps, policy.dt if stamps == "seconds" and dt is None else dt, clock)
+        self._idle = None if idle is None else _action(policy, idle, "idle")
+        self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
+        self._telemetry = Telemetry(stamps)
+        self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._new_history())
         policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
 
     @property
     def ready(self) -> bool:
         """Whether an observation has arrived in this episode."""
-        return self._obs is not None
+        return self._episode.ready
 
     @property
     def episode(self) -> int:
         """How many times `reset` was called."""
-        return self._episode
+        return self._episode.number
 
     @property
     def step(self) -> int:
         """The step that the newest command is for; -1 before the first."""
-        return self._history.length - 1
+        return self._episode.history.length - 1
+
+    @property
+    def statistics(self) -> Statistics:
+        """What has happened so far, as a snapshot."""
+        with self._state_lock:
+            return self._telemetry.snapshot(self._episode.history)
 
     def reset(self, now: float | None = None) -> None:
-        """Start an episode: forget observations and actions. What was stamped before `now` (seconds) will not be used.
+        """Start an episode: forget observations and actions. Later stamps before `now` (seconds) are ignored.
 
         Raises:
             ClockError: `now` is not finite, or beyond ±1e15.
         """
-        with self._acting, self._state:
-            start = 0.0 if self.stamps == "steps" else self._time(now)
-            self._missed += self._history.missed
-            self._replaced += self._history.replaced
-            self._episode += 1
-            self._begin(start)
+        with self._act_lock, self._state_lock:
+            start = 0.0 if self.stamps == "steps" else self._clock.now(now, 0)
+            self._telemetry.end_episode(self._episode.history)
+            self._episode = Episode(self.episode + 1, start, self._clock, self._new_history())
 
     def observe(self, obs: ArrayLike, stamp: float, now: float | None = None, *, episode: int | None = None) -> Arrival:
-        """Take in an observation, in whatever order and however often it arrives.
+        """Take in an observation. Call it for every one that arrives, in any order and as often as it arrives.
 
         Args:
             obs: [S].
             stamp: when it was made: how many steps were over, or seconds.
-            now: when it arrived; left out: the clock, or the steps commanded so far. These stand still until the first
-                command, so give `now` until then: if s_0 is lost, s_1 would be of the future.
-            episode: where it belongs, as `controller.episode` counts; None for the present one. Stamps in steps start
-                again at 0: what may still travel when an episode ends must carry it.
+            now: when it arrived; by default the clock, or the steps commanded so far. These are 0 until the first
+                command, so give `now` until then: if s_0 is lost, s_1 would lie in the future.
+            episode: its episode, as `controller.episode` counts; None for the present one. Give it with stamps in
+                steps, which start again at 0, if an observation may arrive after its episode has ended.
 
         Returns:
-            "new" if it is the newest now. Else why it is not used: "late" (older than the newest, or of another
-            episode), "duplicate" (the newest's stamp; the first one counts), "invalid" (not finite in single precision,
-            a step below 0, or a stamp beyond ±1e15), "future" (stamped more than half a period after `now`).
+            What became of it; see `Arrival`.
 
         Raises:
-            DelayRLError: another size, a stamp that is no number or a fraction of a step: mistakes of a program,
-                not of a network.
+            DelayRLError: a wrong size, or a stamp that is not a number or a fraction of a step.
         """
-        values = _numbers(obs, np.float64)
-        if values.shape != (self.policy.obs_size,):
-            raise DelayRLError(
-                f"the policy takes observations of size {self.policy.obs_size}; got shape {values.shape}"
-            )
-        stamp = self._number(stamp)
-        with self._state:
-            arrival = self._judge(values, stamp, now, episode)
-            self._counts[arrival] += 1
-            if arrival == "new":
-                self._obs, self._stamp = values, stamp
-                if self._start == -math.inf:
-                    self._start = stamp
+        values, stamp = _observation(self.policy, obs), self._clock.number(stamp)
+        with self._state_lock:
+            arrival = self._episode.observe(values, stamp, now, episode)
+            self._telemetry.count(arrival)
         return arrival
 
     def act(self, now: float | None = None) -> Action:
         """Choose the command that is given to the plant at `now`.
 
         Args:
-            now: how many steps are over, or seconds; left out: one step after the last call, or the clock. Where
-                commands take effect at times that are known beforehand, the time of the effect, less κ·dt.
+            now: how many steps are over, or seconds; by default one step after the last call, or the clock. Where the
+                time when the command takes effect is known, give that time less κ·dt.
 
         Returns:
-            [A], in the policy's range. It is in the history; if the plant does something else, tell `applied`.
+            [A], in the policy's range. It is in the history; if the plant does something else, call `applied`.
 
         Raises:
             DelayRLError: no observation yet, or the policy's action is not finite. Nothing is recorded.
-            ClockError: `now` is not after the last call, or more than half a period before the newest observation.
-                Nothing is recorded.
-            OverrunError: with `on_overrun="raise"`. Only the overrun is.
+            ClockError: `now` is not after the last call, or before the newest observation. Nothing is recorded.
+            OverrunError: with `on_overrun="raise"`. Only the overrun is counted.
         """
         policy, limit = self.policy, self.policy.max_age
-        with self._acting:
-            with self._state:
-                now = self._forward(now)
-                if self._obs is None:
-                    raise DelayRLError("no observation has arrived in this episode: wait until `controller.ready`")
-                if self._stamp > now + self._period / 2:
-                    raise ClockError(f"time went backwards: now is {now:g}, an observation of {self._stamp:g} is here")
-                step, age, since = self._history.age(self._stamp, now, self._elapsed(now))
-                warm = self._first is not None and step > self._first
-                obs, stamp, action = self._obs.copy(), self._stamp, self._history.last.copy()
+        with self._act_lock:
+            with self._state_lock:
+                now = self._episode.command_time(now)
+                newest = self._episode.newest(now)
+                age, action = newest.age, self._episode.history.last.copy()
                 if age > limit:
-                    self._counts["overruns"] += 1
+                    self._telemetry.count("overruns")
                     if self.on_overrun == "raise":
                         raise OverrunError(f"the policy was trained for ages 0..{limit}; the newest is {age} steps old")
-            if age <= limit or (self.on_overrun == "clip" and len(since) == age):
-                shown = min(age, limit)
-                actions = np.zeros((limit, policy.action_size), np.float32)
-                if shown:
-                    actions[:shown] = since[:shown]
-                action = self._action(policy(obs, actions, shown), "the policy's action")
-                action = np.clip(action, policy.low, policy.high).astype(np.float32)
-            with self._state:
-                before = self._record(action, now)
-                self._counts["decisions"] += 1
-                if warm:
-                    self._ages.add(age)
-                    if self.stamps == "seconds":
-                        self._delays.add(now - stamp)
-                        self._periods.add(now - before)
+            if age <= limit or (self.on_overrun == "clip" and len(newest.actions) == age):
+                action = _decide(policy, newest.obs, newest.actions, min(age, limit))
+            with self._state_lock:
+                period = self._episode.record(action, now)
+                self._telemetry.count("decisions")
+                if newest.warm:
+                    self._telemetry.add(age, newest.delay, period)
         return action.copy()
 
     def override(self, action: ArrayLike, now: float | None = None) -> None:
-        """Take down a command that somebody else (a person, a safe stop) gives to the plant at `now`; for `act`.
+        """Record a command that somebody else (a person, a safe stop) gives to the plant at `now`, in place of `act`.
 
         Raises:
-            DelayRLError: another size, or not finite.
+            DelayRLError: a wrong size, or not finite.
             ClockError: `now` is not after the last call.
         """
-        values = self._action(action, "the action")
-        with self._acting, self._state:
-            self._record(values, self._forward(now))
-            self._counts["overridden"] += 1
+        values = _action(self.policy, action, "the action")
+        with self._act_lock, self._state_lock:
+            self._episode.record(values, self._episode.command_time(now))
+            self._telemetry.count("overridden")
 
     def applied(self, action: ArrayLike, step: int | None = None) -> bool:
-        """Correct the history: what the plant really did in a step: an actuator saturated, a packet was lost.
+        """Correct the history where the plant did something else: an actuator saturated, a packet was lost.
 
         Args:
-            action: [A]; it may lie outside of the policy's range.
+            action: what the plant did, [A]; it may lie outside the policy's range.
             step: as `controller.step` was after `act`; None for the newest.
 
         Returns:
             Whether the step is still remembered.
 
         Raises:
-            DelayRLError: another size, not finite, or a step that has no action.
+            DelayRLError: a wrong size, not finite, or a step that has no action.
         """
-        values = self._action(action, "the action")
-        with self._state:
-            step = self._history.length - 1 if step is None else _whole(step)
-            if not 0 <= step < self._history.length:
-                raise DelayRLError(f"there are actions of {self._history.length} steps, from 0 on; got step {step}")
-            return self._history.correct(values, step)
+        values = _action(self.policy, action, "the action")
+        with self._state_lock:
+            history = self._episode.history
+            step = history.length - 1 if step is None else _step(step)
+            if not 0 <= step < history.length:
+                raise DelayRLError(f"there are actions of {history.length} steps, from 0 on; got step {step}")
+            return history.correct(values, step)
 
-    @property
-    def statistics(self) -> Statistics:
-        """A snapshot."""
-        with self._state:
-            return Statistics(
-                **self._counts,
-                missed=self._missed + self._history.missed,
-                replaced=self._replaced + self._history.replaced,
-                counted=self._ages.count,
-                age_mean=self._ages.mean,
-                age_std=self._ages.std,
-                age_max=int(self._ages.largest) if self._ages.count else 0,
-                delay_mean=self._delays.mean,
-                delay_std=self._delays.std,
-                period_mean=self._periods.mean,
-                period_std=self._periods.std,
-            )
+    def _new_history(self) -> History:
+        first = _in_range(self.policy, np.zeros(self.policy.action_size, np.float32))
+        capacity = self.policy.max_age + self.action_delay + EXTRA_STEPS
+        return History(self._clock.period, self.action_delay, capacity, self._idle, first)
 
-    def _begin(self, start: float) -> None:
-        policy = self.policy
-        first = np.clip(np.zeros(policy.action_size, np.float32), policy.low, policy.high).astype(np.float32)
-        kept = policy.max_age + self.action_delay + KEPT
-        self._history = History(self._period, self.action_delay, kept, self._idle, first)
-        self._obs = None
-        self._stamp, self._start = -math.inf, start  # start: -inf if the first observation or command is to say it
-        self._last = -math.inf  # when the last command was given
-        self._first = None  # steps before the first command
 
-    def _record(self, action: Action, now: float) -> float:
-        if self._start == -math.inf:
-            self._start = now
-        elapsed = self._elapsed(now)
-        self._first = elapsed if self._first is None else self._first
-        self._history.record(action, now, elapsed)
-        before, self._last = self._last, now
-        return before
+def _action_delay(policy: ControlPolicy, given: Any) -> int:
+    """Return the given action delay, or the policy's own. Raises DelayRLError if the policy cannot serve it."""
+    steps = getattr(policy, "action_delay", 0) if given is None else given
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 0:
+        raise DelayRLError(f"action_delay counts whole steps; got {steps!r}")
+    if steps > policy.max_age:
+        raise DelayRLError(f"an action delay of {steps} steps is above the policy's longest age, {policy.max_age}")
+    return int(steps)
 
-    def _elapsed(self, now: float) -> int:
-        """Steps from the start of the episode to `now`: without a command, if the first one is given then."""
-        return max(0, math.floor((now - self._start) / self._period + 0.5))
 
-    def _judge(self, values: NDArray[Any], stamp: float, now: float | None, episode: int | None) -> Arrival:
-        with np.errstate(over="ignore"):  # policies compute in single precision
-            finite = np.isfinite(values.astype(np.float32)).all()
-        if not (finite and abs(stamp) <= FARTHEST) or (self.stamps == "steps" and stamp < 0):
-            return "invalid"
-        if (episode is not None and episode != self._episode) or stamp < self._start:
-            return "late"
-        if stamp > self._time(now) + self._period / 2:
-            return "future"
-        if stamp == self._stamp:
-            return "duplicate"
-        return "late" if stamp < self._stamp else "new"
+def _decide(policy: ControlPolicy, obs: NDArray[Any], actions: Sequence[Action], age: int) -> Action:
+    """Call the policy at an age that it serves, with the first `age` actions; return its action in range, [A]."""
+    shown = np.zeros((policy.max_age, policy.action_size), np.float32)
+    if age:
+        shown[:age] = actions[:age]
+    return _in_range(policy, _action(policy, policy(obs, shown, age), "the policy's action"))
 
-    def _forward(self, now: float | None) -> float:
-        """`now`, if it is after the last command."""
-        now = self._time(now)
-        if now <= self._last:
-            raise ClockError(f"time went backwards: now is {now:g}, the last command was given at {self._last:g}")
-        if self.stamps == "steps" and now < 0:
-            raise ClockError(f"steps count from 0; now is {now:g}")
-        return now
 
-    def _time(self, now: float | None) -> float:
-        """`now`, or what stands for it."""
-        if now is None:
-            now = self._clock() if self.stamps == "seconds" else max(0, self._history.length - self.action_delay)
-        now = self._number(now)
-        if not abs(now) <= FARTHEST:
-            raise ClockError(f"now must be finite, within ±{FARTHEST:g}; got {now}")
-        return now
+def _in_range(policy: ControlPolicy, action: Action) -> Action:
+    return np.clip(action, policy.low, policy.high).astype(np.float32)
 
-    def _number(self, stamp: float) -> float:
-        if isinstance(stamp, bool | np.bool_) or not isinstance(stamp, int | float | np.integer | np.floating):
-            raise DelayRLError(f"a time is a number of {self.stamps}; got {stamp!r}")
-        try:
-            time = float(stamp)
-        except OverflowError:  # a whole number above all floating-point ones
-            time = math.inf if stamp > 0 else -math.inf
-        if self.stamps == "steps" and math.isfinite(time) and time != math.floor(time):
-            raise DelayRLError(f"steps are whole numbers; got {stamp!r}. For seconds: stamps='seconds'")
-        return time
 
-    def _action(self, action: ArrayLike, what: str) -> Action:
-        values = _numbers(action, np.float32)
-        if values.shape != (self.policy.action_size,) or not np.isfinite(values).all():
-            raise DelayRLError(f"{what} must be {self.policy.action_size} finite numbers; got {values.tolist()}")
-        return values
+def _observation(policy: ControlPolicy, obs: ArrayLike) -> NDArray[np.float64]:
+    values = _numbers(obs, np.float64)
+    if values.shape != (policy.obs_size,):
+        raise DelayRLError(f"the policy takes observations of size {policy.obs_size}; got shape {values.shape}")
+    return values
+
+
+def _action(policy: ControlPolicy, action: ArrayLike, name: str) -> Action:
+    values = _numbers(action, np.float32)
+    if values.shape != (policy.action_size,) or not np.isfinite(values).all():
+        raise DelayRLError(f"{name} must be {policy.action_size} finite numbers; got {values.tolist()}")
+    return values
 
 
 def _numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
     try:
-        with np.errstate(over="ignore"):  # to infinity, which is refused where it matters
+        with np.errstate(over="ignore"):  # overflow gives infinity, which is refused where it matters
             return np.array(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:
         raise DelayRLError(f"a flat array of numbers is needed; got {' '.join(repr(values).split())[:80]}") from error
 
 
-def _whole(step: int) -> int:
+def _step(step: int) -> int:
     try:
         return operator.index(step)
     except TypeError:
