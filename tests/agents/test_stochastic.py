@@ -176,13 +176,13 @@ def test_custom_laws_are_refused_in_training(tmp_path: Path) -> None:
     class Mine:
         maximum = 2
 
-        def draw(self, memory: int, random: np.random.Generator) -> tuple[int, int]:
-            return 2, memory
+        def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
+            return 2, state
 
         def shifted(self, steps: int) -> "Mine":
             return self
 
-    with pytest.raises(delayrl.DelayRLError, match=r"delayrl\.delays|is no number"):
+    with pytest.raises(delayrl.DelayRLError, match=r"delayrl\.delays|is not a number"):
         train("a-sac", tmp_path / "run", delay=Delay(Channel(Mine())))  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
 

@@ -1,4 +1,4 @@
-"""Laws draw what they say, are values, can be written as text; and bad ones are refused in one line."""
+"""Delay laws, channels and their text form; bad ones are refused in one line."""
 
 from pathlib import Path
 
@@ -30,9 +30,9 @@ from strategies import DELAYS, LAWS
 
 def drawn(law: object, count: int, seed: int = 0) -> list[int]:
     """One long episode."""
-    random, memory, values = np.random.default_rng(seed), 0, []
+    random, state, values = np.random.default_rng(seed), 0, []
     for _ in range(count):
-        value, memory = law.draw(memory, random)  # type: ignore[attr-defined]
+        value, state = law.draw(state, random)  # type: ignore[attr-defined]
         values.append(value)
     return values
 
@@ -135,18 +135,18 @@ def test_channels_of_a_text() -> None:
     [
         ("-1", "negative"),
         ("2.5", "whole"),
-        ("soon", "is no number"),
-        ("nan", "is no number"),
-        ("", "is no number"),
+        ("soon", "is not a number"),
+        ("nan", "is not a number"),
+        ("", "is not a number"),
         ("unifrom:1:5", "unknown delay"),
         ("uniform:5:1", "LOW ≤ HIGH"),
-        ("uniform:1", "takes 2 numbers"),
+        ("uniform:1", "needs 2 values"),
         ("uniform:-1:3", "negative"),
-        ("uniform:0:99999999", "longer than we can hold"),
+        ("uniform:0:99999999", "at most 100000"),
         ("choice:1=0.5,2=0.6", "sum to 1.1"),
         ("choice:1=0.5", "sum to 0.5"),
         ("choice:1=-1,2=2", "from 0 to 1"),
-        ("choice:1", "is no number"),
+        ("choice:1", "is not a number"),
         ("markov:1,2:1,0", "square"),
         ("gilbert:1:5:2:0.1", "from 0 to 1"),
         ("walk:3:2", "from 0 to 1"),
@@ -154,14 +154,14 @@ def test_channels_of_a_text() -> None:
         ("gamma:100:1:3", "never below"),
         ("5@soon", "newest, fifo, raw"),
         ("80ms", "no `dt`"),
-        ("1+2", "is no number"),
+        ("1+2", "is not a number"),
         ("1+observation=2", "two for the observations"),
         ("2+reward=3@raw", "newest or fifo"),
         ("recorded:nowhere.csv", "No such file"),
         ("recorded:a+b@c.csv", "a\\+b@c.csv"),
         ("recorded", "unknown delay"),
         ("recorded:" + "9" * 5000 + ",", "No such file|too long"),
-        ("1e400", "is no number|finite|whole"),
+        ("1e400", "is not a number|finite|whole"),
         ("gamma:1e-200:1:5", "between"),
         ("gamma:1:1e200:5", "between"),
         ("walk:100000", "1 to 1000 states"),

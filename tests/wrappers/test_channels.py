@@ -8,11 +8,11 @@ import pytest
 from gymnasium.wrappers import DelayObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_delays import DELAYS
 
 import delayrl
 from delayrl.delays import Delay, as_delay
 from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
+from strategies import DELAYS
 
 
 class Journal(gym.Env):

@@ -77,7 +77,7 @@ def test_needs_no_jax() -> None:
 
 @pytest.mark.parametrize(
     ("delay", "words"),
-    [(-1, "negative"), (2.5, "whole"), ("x", "no number"), (True, "whole"), (50, "no shorter than an episode")],
+    [(-1, "negative"), (2.5, "whole"), ("x", "not a number"), (True, "whole"), (50, "no shorter than an episode")],
 )
 def test_bad_delays(delay: object, words: str) -> None:
     with pytest.raises(delayrl.DelayRLError, match=words):

@@ -1,6 +1,6 @@
-"""How late things are: laws of travel times, channels with arrival rules, and their text form. NumPy alone."""
+"""Laws of travel times, channels with arrival rules, and the text form of both. Needs NumPy alone."""
 
-from delayrl.delays.channels import PAPER_STOCHASTIC_5, Channel, Delay, Rule, as_delay
+from delayrl.delays.channels import PAPER_STOCHASTIC_5, Channel, Delay, as_delay
 from delayrl.delays.laws import (
     Choice,
     Constant,
@@ -11,9 +11,10 @@ from delayrl.delays.laws import (
     gilbert_elliott,
     poisson,
     random_walk,
-    recorded,
     uniform,
 )
+from delayrl.delays.recordings import recorded
+from delayrl.delays.text import Rule, short_label
 
 __all__ = [
     "PAPER_STOCHASTIC_5",
@@ -31,5 +32,6 @@ __all__ = [
     "poisson",
     "random_walk",
     "recorded",
+    "short_label",
     "uniform",
 ]

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import RescaleAction
 
-from delayrl.delays import Channel, Delay, DelayLaw
+from delayrl.delays import Channel, Delay, DelayLaw, as_delay
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError
 from delayrl.wrappers import Delayed, check_spaces
@@ -64,10 +64,18 @@ def make(
 
 
 def delay_of(env: str, delay: float | str | DelayLaw | Channel | Delay) -> Delay:
-    """A delay in steps of this task. Raises what `make` raises."""
-    task = make(env, delay)
-    task.close()
-    return task.delay
+    """Convert a delay to steps of a task. The task is made only if its step length is needed.
+
+    Raises:
+        DelayRLError: a bad delay; a time for a task that is unknown or does not say how long a step is.
+    """
+
+    def step_seconds() -> float | None:
+        task = make(env)
+        task.close()
+        return seconds_of(task)
+
+    return as_delay(delay, step_seconds)
 
 
 def physics(env: gym.Env[Any, Any]) -> dict[str, str | None]:

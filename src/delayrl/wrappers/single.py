@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from delayrl.delays import Channel, Delay, DelayLaw, as_delay
-from delayrl.delays.laws import whole
+from delayrl.delays.units import whole_steps
 from delayrl.errors import DelayRLError
 from delayrl.wrappers.transit import Fill, Transit
 
@@ -63,7 +63,7 @@ def check_length(env: Any, delay: Delay, history: int | None, fill: str) -> int:
         )
     if fill not in ("first", "zeros"):
         raise DelayRLError(f"fill must be first or zeros; got {fill!r}")
-    if history is not None and whole(history) < delay.maximum:
+    if history is not None and whole_steps(history) < delay.maximum:
         raise DelayRLError(f"a history of {history} actions is too short for ages up to {delay.maximum}")
     return delay.maximum if history is None else history
 

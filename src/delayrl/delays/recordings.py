@@ -1,0 +1,62 @@
+"""Files of measured delays."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from delayrl.delays.laws import Recorded
+from delayrl.delays.units import in_steps, is_number, rounded_up
+from delayrl.errors import DelayRLError, first_line
+
+
+def recorded(path: str | Path, step_seconds: float | None = None, unit: str = "") -> Recorded:
+    """Read measured delays from a file.
+
+    Args:
+        path: a .npy file, or a text file with one number per line. Of several columns the last one counts, and a text
+            file may start with a header.
+        step_seconds: the length of an environment step, needed if `unit` is a time.
+        unit: "" for whole steps; "s" or "ms" for times, which are rounded up to whole steps.
+
+    Raises:
+        DelayRLError: a missing or empty file, or a value that is not a finite number of at least 0.
+    """
+    path = Path(path).expanduser()
+    try:
+        cells = _cells(path)
+    except OSError as error:
+        raise DelayRLError(f"cannot read the recorded delays {path}: {error.strerror or error}") from error
+    except (ValueError, EOFError) as error:
+        raise DelayRLError(f"{path} cannot be read as recorded delays: {first_line(error)}") from error
+    if not cells:
+        raise DelayRLError(f"{path} holds no delays: it is empty")
+    steps = []
+    for place, cell in cells:
+        if not is_number(cell):
+            raise DelayRLError(f"{path}, {place}: recorded delays must be numbers; got {cell[:40]!r}")
+        value = float(cell)
+        if not (math.isfinite(value) and value >= 0):
+            raise DelayRLError(f"{path}, {place}: recorded delays must be finite and not negative; got {value:g}")
+        if not unit and not value.is_integer():
+            raise DelayRLError(
+                f"{path}, {place}: recorded delays must be whole numbers of steps; got {value:g}. "
+                f"For times write recorded:{path}:ms or :s"
+            )
+        steps.append(rounded_up(in_steps(value, unit, step_seconds)))
+    return Recorded(tuple(steps))
+
+
+def _cells(path: Path) -> list[tuple[str, str]]:
+    """Read the values of a file as text, each with its place in the file."""
+    if path.suffix == ".npy":
+        # memory-mapped, because a header may promise more values than the file holds
+        array = np.load(path, allow_pickle=False, mmap_mode="r")
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf" or array.ndim > 2:
+            raise ValueError("not an array of numbers with one or two axes")
+        column = array if array.ndim < 2 else array[:, -1]
+        return [(f"entry {i}", repr(value)) for i, value in enumerate(np.atleast_1d(column).astype(float).tolist())]
+    lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
+    cells = [(f"line {i}", line.split(",")[-1].strip().strip('"')) for i, line in lines if line.strip()]
+    has_header = bool(cells) and not is_number(cells[0][1])
+    return cells[1:] if has_header else cells
