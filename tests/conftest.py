@@ -2,7 +2,7 @@
 
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.delays import Delay  # noqa: E402
 from delayrl.envs import make  # noqa: E402
 from delayrl.training.actor import Actor  # noqa: E402
+from delayrl.training.learner import Learner, Program, Stored  # noqa: E402
 
 TINY_SAC = SAC(hidden=(16, 16), batch_size=16)
 TINY = {
@@ -64,11 +65,29 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+def learned(
+    program: Program,
+    keys: jax.Array,
+    trajectories: list[list],
+    random_steps: int,
+    *,
+    hidden: Callable[[int], int] = lambda step: 0,
+    capacity: int = 200,
+    block: int = 1,
+) -> Iterator[tuple[Learner, dict]]:
+    """Learn from one trajectory for each seed as the loop does; yield the learner and its metrics after each block."""
+    learner = program.init(keys, capacity)
+    for end in range(block, len(trajectories[0]) + 1, block):
+        steps = range(end - block + 1, end + 1)
+        pending = [[Stored(steps_of[n - 1], np.int32(hidden(n))) for steps_of in trajectories] for n in steps]
+        learner, metrics, _ = program.learn(learner, pending, keys, end, random_steps)
+        yield learner, metrics
+
+
 def record(env: str, delay: int | str | Delay, steps: int, seed: int = 0) -> tuple[list, list]:
     """Random play: every transition, and what the wrapper showed before each of its actions."""
     rng = np.random.default_rng(seed)
     actor = Actor(make(env, delay, rescale=True), seed, privileged=False)
-    actor.reset()
     transitions, shown = [], []
     for _ in range(steps):
         shown.append(actor.seen)

@@ -27,7 +27,7 @@ from delayrl.envs import delay_of, make
 from delayrl.play.policy import spec_of
 from delayrl.run.configuration import override
 from delayrl.training.actor import Actor
-from delayrl.training.buffers import keep_memory
+from delayrl.training.buffers import keep_buffers
 from delayrl.training.train import on_device
 
 ROWS = 2_000
@@ -157,7 +157,7 @@ def prepare(side: dict[str, Any]) -> Prepared:
     actor = Actor(make(side["env"], delay.observed(), rescale=True), 0, agent.privileged)
     actor.reset()
     spec = spec_of(actor.env)
-    keep_memory(agent, spec, side["seeds"])  # as `train` does
+    keep_buffers(agent, spec, side["seeds"])  # as `train` does
     keys = jax.vmap(jax.random.key)(jnp.arange(side["seeds"]))
     state = jax.jit(jax.vmap(partial(agent.init, spec)))(keys)
     replay = jax.tree.map(lambda x: jnp.stack([x] * side["seeds"]), filled(spec, ROWS))
@@ -240,7 +240,7 @@ def main() -> None:
     precision = side["options"].get(
         "precision", "float32"
     )  # else the products of a GPU would be coarser than training's
-    if on_cpu := side["device"] == "cpu":  # chosen without looking for it, which `keep_memory` is to come before
+    if on_cpu := side["device"] == "cpu":  # chosen without looking for it, which `keep_buffers` is to come before
         jax.config.update("jax_platforms", "cpu")
     with on_device(None if on_cpu else side["device"]), jax.default_matmul_precision(PRODUCTS[precision]):
         print(json.dumps(parts(side)))

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conftest import record
+from conftest import learned, record
 from delayrl.agents.adsac import ADSAC, State
 from delayrl.agents.sac import SAC
 from delayrl.core import networks
 from delayrl.core import replay as ring
-from delayrl.core.types import Seen, Spec, Transition, Window
+from delayrl.core.types import Seen, Spec, Window
 from delayrl.errors import DelayRLError
-from delayrl.training.learner import Program, Stored
+from delayrl.training.learner import Program
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)
@@ -57,7 +57,7 @@ def test_inputs_are_aligned(auxiliary_delay: int) -> None:
     windows = windows_of("delayrl/Counter-v0", Spec(2, 1, 4), 300)
     agent = ADSAC(auxiliary_delay=auxiliary_delay)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
-    for ahead in (0, windows.steps):
+    for ahead in (0, windows.n_step):
         inputs = agent.inputs(windows, ahead)
         for i in range(0, 300, 3):
             step = by_action[float(windows.action[i, 4, 0])]
@@ -77,7 +77,7 @@ def test_next_value_by_hand() -> None:
     for critic, value in zip(constant, (3.0, 5.0), strict=True):
         critic[-1]["b"] += value
     state = state._replace(auxiliary=state.auxiliary._replace(target=constant))
-    later = agent.inputs(windows_of(), windows_of().steps)
+    later = agent.inputs(windows_of(), windows_of().n_step)
     auxiliary_key, augmented_key = jax.random.split(jax.random.key(3))
     value, entropies = agent.next_value(state, later, auxiliary_key, augmented_key)
     short = networks.sample(TINY.policy(state.auxiliary.actor, later.auxiliary), auxiliary_key)[1]
@@ -91,7 +91,7 @@ def test_next_value_by_hand() -> None:
 def test_each_actor_has_its_target_critic() -> None:
     """Swapping the target critics changes the value; so does each actor's temperature where its term is lower."""
     agent, state = started()
-    later = agent.inputs(windows_of(), windows_of().steps)
+    later = agent.inputs(windows_of(), windows_of().n_step)
     keys = jax.random.split(jax.random.key(3))
     value, _ = agent.next_value(state, later, *keys)
     swapped = state.auxiliary._replace(target=state.auxiliary.target[::-1])
@@ -104,10 +104,10 @@ def test_critic_loss_by_hand() -> None:
     windows = windows_of()
     key = jax.random.key(5)
     auxiliary_key, augmented_key, _ = jax.random.split(key, 3)
-    value, _ = agent.next_value(state, agent.inputs(windows, windows.steps), auxiliary_key, augmented_key)
+    value, _ = agent.next_value(state, agent.inputs(windows, windows.n_step), auxiliary_key, augmented_key)
     y = []
     for i in range(16):
-        k = int(windows.steps[i])
+        k = int(windows.n_step[i])
         rewards = np.asarray(windows.reward[i, DELAY : DELAY + k], np.float64)
         ended = bool(windows.terminated[i, DELAY + k - 1])
         y.append(sum(0.99**j * r for j, r in enumerate(rewards)) + 0.99**k * (1 - ended) * float(value[i]))
@@ -122,12 +122,12 @@ def test_equal_delays_are_a_sac() -> None:
     agent, _ = started(DELAY, actor_updates=1)
     windows, key = windows_of(), jax.random.key(7)
     one = agent.learner.init(SPEC, jax.random.key(1))
-    state = State(one, one.actor, one.log_temperature, one.actor_memory, one.temperature_memory)
+    state = State(one, one.actor, one.log_temperature, one.actor_opt_state, one.temperature_opt_state)
     expected, metrics = agent.learner.update(one, windows, key, jnp.int32(1))
 
     target_key, actor_key = jax.random.split(key)
     draw, redraw = jax.random.split(jax.random.split(actor_key, 1)[0])
-    now, later = agent.inputs(windows, 0), agent.inputs(windows, windows.steps)
+    now, later = agent.inputs(windows, 0), agent.inputs(windows, windows.n_step)
     value, entropies = agent.next_value(state, later, target_key, target_key)
     auxiliary, of_critic = agent.learner.learn_critic(state.auxiliary, windows, now.auxiliary, value)
     state = state._replace(auxiliary=auxiliary)
@@ -139,8 +139,8 @@ def test_equal_delays_are_a_sac() -> None:
     near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, redraw), expected)
     long = agent.improve_augmented(state, now, draw)
     assert same(long.auxiliary, auxiliary)
-    near((long.actor, long.actor_memory), (expected.actor, expected.actor_memory))
-    assert same((long.actor, long.actor_memory), (short.auxiliary.actor, short.auxiliary.actor_memory))
+    near((long.actor, long.actor_opt_state), (expected.actor, expected.actor_opt_state))
+    assert same((long.actor, long.actor_opt_state), (short.auxiliary.actor, short.auxiliary.actor_opt_state))
 
 
 def test_a_coin_says_which_actor_learns() -> None:
@@ -244,13 +244,7 @@ def test_the_loop_repeats_itself() -> None:
 
     def run():
         keys = jax.vmap(jax.random.key)(jnp.arange(1))
-        learner = program.init(keys, 100)
-        for step, transition in enumerate(transitions, 1):
-            batched = Transition(*(np.asarray(x)[None] for x in transition))
-            due = (0,) if step > 30 else ()
-            learner, metrics = program.learn(
-                learner, [Stored(batched, np.full(1, DELAY, np.int32))], keys, range(step, step + 1), [due]
-            )
+        *_, (learner, metrics) = learned(program, keys, [transitions], 31, hidden=lambda step: DELAY, capacity=100)
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
         return learner.agent
 

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conftest import TINY, TINY_SAC, record
+from conftest import TINY, TINY_SAC, learned, record
 from delayrl.agents.random import Random
 from delayrl.agents.registry import AGENTS
 from delayrl.agents.vdpo import VDPO, Unseen, unseen
 from delayrl.core import networks
 from delayrl.core import replay as ring
-from delayrl.core.types import Seen, Spec, Transition
+from delayrl.core.types import Seen, Spec
 from delayrl.errors import DelayRLError
 from delayrl.training.learner import Program, Stored
 
@@ -34,14 +34,8 @@ def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=N
     transitions = transitions or record(ENV, delay, 120)[0]
     program = program_of(agent, delay)
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
-    learner = program.init(keys, 200)
-    start = len(transitions) - updates
-    for step, transition in enumerate(transitions, 1):
-        due = tuple(i for i, p in enumerate(program.phases) if step > start and step % p.every == 0)
-        batched = Transition(*(np.asarray(x)[None] for x in transition))
-        learner, metrics = program.learn(
-            learner, [Stored(batched, np.full(1, hidden, np.int32))], keys, range(step, step + 1), [due]
-        )
+    first_update = len(transitions) - updates + 1
+    *_, (learner, metrics) = learned(program, keys, [transitions], first_update, hidden=lambda step: hidden)
     return learner, metrics, keys
 
 
@@ -116,15 +110,8 @@ def test_lockstep_seeds_are_seeds_alone(name: str) -> None:
     data = [record(ENV, 3, 60, seed)[0] for seed in range(3)]
 
     def run(seeds: list[int]):
-        program = program_of(agent, 3)
         keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-        learner = program.init(keys, 100)
-        for step in range(1, 61):
-            due = tuple(i for i, p in enumerate(program.phases) if step > 45 and step % p.every == 0)
-            batch = jax.tree.map(lambda *x: np.stack(x), *[data[s][step - 1] for s in seeds])
-            learner, _ = program.learn(
-                learner, [Stored(batch, np.zeros(len(seeds), np.int32))], keys, range(step, step + 1), [due]
-            )
+        *_, (learner, _) = learned(program_of(agent, 3), keys, [data[seed] for seed in seeds], 46, capacity=100)
         return learner.agent
 
     together = run([0, 1, 2])
@@ -142,16 +129,12 @@ def test_a_block_of_steps_is_its_steps(name: str) -> None:
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
     ends = []
     for block in (1, 5):
-        learner, metrics = program.init(keys, 100), {}
-        for end in range(block, len(data) + 1, block):
-            steps = range(end - block + 1, end + 1)
-            stored = [
-                Stored(jax.tree.map(lambda x: np.asarray(x)[None], data[n - 1]), np.full(1, n % 3)) for n in steps
-            ]
-            due = [tuple(i for i, p in enumerate(program.phases) if n > 60 and n % p.every == 0) for n in steps]
-            learner, new = program.learn(learner, stored, keys, steps, due)
+        metrics = {}
+        options = {"hidden": lambda step: step % 3, "capacity": 100, "block": block}
+        for learner, new in learned(program, keys, [data], 61, **options):
             metrics |= new
-        ends.append((learner, metrics))
+            last = learner
+        ends.append((last, metrics))
     assert set(ends[0][1]) == set(ends[1][1])
     for a, b in zip(jax.tree.leaves(ends[0][0]), jax.tree.leaves(ends[1][0]), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
@@ -169,7 +152,7 @@ def test_learning_copies_no_replay(seeds: int, block: int) -> None:
     needed = []
     for capacity in (200, 100_000):
         learner = jax.eval_shape(lambda capacity=capacity: program.init(keys, capacity))
-        lowered = program._jitted_learn.lower(learner, stored, keys, steps, index=0)
+        lowered = program._jitted_learn.lower(learner, stored, keys, steps, first_phase=True)
         compiled = lowered.compile({"xla_backend_optimization_level": 3})
         needed.append(compiled.memory_analysis().temp_size_in_bytes)
     assert needed[0] == needed[1]
@@ -262,7 +245,7 @@ def test_bpql_is_aligned() -> None:
     """On a counter: critics at (s_t, a_t) with t the true step, the actor at s_{t-d} with the actions since."""
     transitions, windows = counted(2, 80, batch=500, ahead=1)
     actor, critic = TINY["bpql"]._inputs(windows, 0)
-    actor_next, critic_next = TINY["bpql"]._inputs(windows, windows.steps)
+    actor_next, critic_next = TINY["bpql"]._inputs(windows, windows.n_step)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     for i in range(500):
         step = by_action[float(windows.action[i, 2, 0])]
@@ -298,7 +281,7 @@ def test_actor_and_temperature_move_every_second_time() -> None:
     assert same(even.log_temperature, state.log_temperature)
     assert not same(even.critic, state.critic)
     assert same(even.critic, odd.critic)
-    assert int(odd.actor_memory[0].count) == int(odd.temperature_memory[0].count) == 2
+    assert int(odd.actor_opt_state[0].count) == int(odd.temperature_opt_state[0].count) == 2
     expected = jax.tree.map(lambda t, c: 0.995 * t + 0.005 * c, state.target, even.critic)
     for a, b in zip(jax.tree.leaves(even.target), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8)

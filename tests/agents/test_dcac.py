@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conftest import record
+from conftest import learned, record
 from delayrl.agents.dcac import DCAC, Roll, values
 from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
-from delayrl.training.learner import Program, Stored
+from delayrl.training.learner import Program
 
 AGENT = DCAC(hidden=(16, 16), batch_size=16)
 DELAY = 4
@@ -254,16 +254,11 @@ def test_learning_never_peeks() -> None:
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
 
     def run(poison: bool):
-        learner = program.init(keys, 100)
-        for step, transition in enumerate(data, 1):
-            if poison and step > 37:  # s_38, s_39, s_40 have not arrived
-                bad = {"next_obs": np.full_like(transition.next_obs, 1e6), "reward": np.float32(-1e6)}
-                transition = transition._replace(**bad, **({"obs": bad["next_obs"]} if step > 38 else {}))
-            batch = jax.tree.map(lambda x: np.asarray(x)[None], transition)
-            due = (0,) if step == 40 else ()
-            learner, metrics = program.learn(
-                learner, [Stored(batch, np.full(1, 3, np.int32))], keys, range(step, step + 1), [due]
-            )
+        steps = list(data)
+        for step in (38, 39, 40) if poison else ():  # s_38, s_39, s_40 have not arrived
+            bad = {"next_obs": np.full_like(data[0].next_obs, 1e6), "reward": np.float32(-1e6)}
+            steps[step - 1] = steps[step - 1]._replace(**bad, **({"obs": bad["next_obs"]} if step > 38 else {}))
+        *_, (learner, metrics) = learned(program, keys, [steps], 40, hidden=lambda step: 3, capacity=100)
         assert all(np.isfinite(x).all() for x in metrics.values())
         return jax.device_get(learner.agent)
 

@@ -16,7 +16,7 @@ from delayrl.core.networks import mode
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
-from delayrl.training.learner import Program, Stored
+from delayrl.training.learner import Program
 
 AGENT = DIDA(
     SAC(hidden=(16, 16), batch_size=16, actor_updates=1),
@@ -59,10 +59,10 @@ def test_the_expert_learns_as_sac_and_is_frozen_after_its_steps() -> None:
     for a, b in zip(jax.tree.leaves((at_its_end.reference, metrics)), jax.tree.leaves((sac, of_sac)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
     assert metrics.keys() == of_sac.keys()
-    assert same((at_its_end.student, at_its_end.memory), (state.student, state.memory))
+    assert same((at_its_end.student, at_its_end.opt_state), (state.student, state.opt_state))
     after, idle = update()(state, windows, jax.random.key(1), jnp.int32(21))
     assert same(after.reference, state.reference)
-    assert same((after.student, after.memory), (state.student, state.memory))
+    assert same((after.student, after.opt_state), (state.student, state.opt_state))
     assert {float(x) for x in idle.values()} == {0.0}
     assert int(after.steps) == 21
 
@@ -146,13 +146,8 @@ def test_under_the_loop() -> None:
 
     def run() -> list:
         keys = jax.vmap(jax.random.key)(jnp.arange(2))
-        learner, states = program.init(keys, 100), []
-        for step in range(1, 32):
-            due = tuple(i for i, p in enumerate(program.phases) if step > 8 and step % p.every == 0)
-            batch = jax.tree.map(lambda *x: np.stack(x), *[steps[step - 1] for steps in data])
-            learner, metrics = program.learn(
-                learner, [Stored(batch, np.zeros(2, np.int32))], keys, range(step, step + 1), [due]
-            )
+        states = []
+        for learner, metrics in learned(program, keys, data, 9, capacity=100):
             assert all(np.isfinite(x).all() for x in metrics.values())
             states.append(jax.device_get(learner.agent))
         return states

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from conftest import record
+from conftest import learned, record
 from delayrl.agents import lifting
 from delayrl.agents.lifting import Lifting, lifting_loss, moments
 from delayrl.agents.sac import BPQL
 from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.networks import Gaussian
-from delayrl.core.types import Seen, Spec, Transition, Window
+from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import look
 from delayrl.errors import DelayRLError
-from delayrl.training.learner import Stored, compiled
+from delayrl.training.learner import compiled
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)
@@ -218,14 +218,8 @@ def test_hold_is_before_end() -> None:
 def run(transitions, hidden: int):
     program = compiled(TINY, SPEC)
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
-    learner = program.init(keys, 100)
-    for step, transition in enumerate(transitions, 1):
-        batched = Transition(*(np.asarray(x)[None] for x in transition))
-        due = program.phases[0].every
-        last = (0,) if step % due == 0 and step == len(transitions) else ()
-        learner, metrics = program.learn(
-            learner, [Stored(batched, np.full(1, hidden, np.int32))], keys, range(step, step + 1), [last]
-        )
+    last = len(transitions)
+    *_, (learner, metrics) = learned(program, keys, [transitions], last, hidden=lambda step: hidden, capacity=100)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
     return learner.agent
 

@@ -11,16 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import delayrl
-from conftest import TINY, record
+from conftest import TINY, learned, record
 from delayrl.cli.main import main as cli
 from delayrl.core import replay as ring
-from delayrl.core.types import Spec, Transition
+from delayrl.core.protocol import OFFICIAL
+from delayrl.core.types import Spec
 from delayrl.core.views import view
 from delayrl.delays import Channel, Constant, Delay, as_delay
 from delayrl.play.evaluation import evaluate
 from delayrl.training.actor import Actor
-from delayrl.training.learner import Program, Stored
-from delayrl.training.train import Session
+from delayrl.training.learner import Program
+from delayrl.training.loop import Loop, hidden_steps
 from short_runs import arrays, train
 from strategies import CHANNELS
 
@@ -63,14 +64,8 @@ def test_every_agent_learns_under_random_delays(name: str) -> None:
     assert {int(s.age) for s in shown} == {0, 1, 2, 3}
     program = Program(agent, Spec(10, 2, longest))
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
-    learner = program.init(keys, 200)
-    before = jax.device_get(learner.agent)
-    for step, transition in enumerate(transitions, 1):
-        due = tuple(i for i, p in enumerate(program.phases) if step > 105 and step % p.every == 0)
-        batched = Transition(*(np.asarray(x)[None] for x in transition))
-        learner, metrics = program.learn(
-            learner, [Stored(batched, np.zeros(1, np.int32))], keys, range(step, step + 1), [due]
-        )
+    before = jax.device_get(program.init(keys, 200).agent)
+    *_, (learner, metrics) = learned(program, keys, [transitions], 106)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(metrics))
     after = jax.device_get(learner.agent)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after) if np.issubdtype(x.dtype, np.floating))
@@ -83,15 +78,11 @@ def test_every_agent_learns_under_random_delays(name: str) -> None:
 )
 def test_what_may_be_missing_is_hidden(delay: str, longest: int) -> None:
     """An overtaken observation may arrive late, and an action acts before its reward sets out."""
-    late = as_delay(delay)
-    for name in ("bpql", "vdpo"):
-        schedule = delayrl.AGENTS[name].presets["small"].schedule
-        session = Session(TINY[name], schedule, "Reacher-v5", late, [0])
-        actor = session.actors[0]
-        actor.reset()
+    parsed = as_delay(delay)
+    for privileged in (False, True):
+        actor = Actor(delayrl.make("Reacher-v5", parsed.observed(), rescale=True), 0, privileged)
         for t in range(60):
-            expected = 0 if TINY[name].privileged else min(t % 50, longest)
-            assert session._hidden().tolist() == [expected]
+            assert hidden_steps(actor, parsed) == (0 if privileged else min(t % 50, longest))
             actor.step(np.zeros(2, np.float32))
 
 
@@ -105,15 +96,15 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     class KilledError(Exception):
         pass
 
-    learn = Session._learn
+    learn = Loop.learn
 
-    def fail(self: Session):
-        if self.step == 237:
+    def fail(self: Loop):
+        if self.state.step == 237:
             raise KilledError
         return learn(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Session, "_learn", fail)
+        patch.setattr(Loop, "learn", fail)
         with pytest.raises(KilledError):
             train("a-sac", tmp_path / "cut", delay=delay)
     cut = train("a-sac", tmp_path / "cut", delay=delay)
@@ -160,7 +151,7 @@ def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_official_episodes_have_their_own_travel_times() -> None:
     """One start state, as in the released code; but not one sequence of delays."""
-    actor = Actor(delayrl.make("delayrl/Counter-v0", "uniform:0:4", rescale=True), 0, False, official=True)
+    actor = Actor(delayrl.make("delayrl/Counter-v0", "uniform:0:4", rescale=True), 0, False, OFFICIAL)
     actor.reset()
     ages: list[list[int]] = [[]]
     for _ in range(300):

@@ -51,7 +51,7 @@ def test_windows_stay_in_their_episode(delay: int, ahead: int, capacity: int) ->
         assert not windows.reward[i, ~acted].any()
         np.testing.assert_array_equal(windows.terminated[i, acted], (now + offset + 1 == length)[acted])
         assert windows.lead[i] == expected[delay + 1 :].sum()
-        assert 1 <= windows.steps[i] <= windows.lead[i]
+        assert 1 <= windows.n_step[i] <= windows.lead[i]
 
 
 def test_every_start_is_drawn_equally() -> None:
@@ -64,10 +64,10 @@ def test_every_start_is_drawn_equally() -> None:
     expected = 60_000 / 120
     chi2 = sum((n - expected) ** 2 / expected for n in found.values())
     assert chi2 < 119 + 5 * np.sqrt(2 * 119)
-    full = windows.steps[windows.lead == 3]
+    full = windows.n_step[windows.lead == 3]
     assert np.abs(np.bincount(full, minlength=4)[1:] / len(full) - 1 / 3).max() < 0.02
     last = {float(t.action[0]) for t in transitions if t.terminated}
-    steps = {int(k) for k, a in zip(windows.steps, windows.action[:, 2, 0], strict=True) if float(a) in last}
+    steps = {int(k) for k, a in zip(windows.n_step, windows.action[:, 2, 0], strict=True) if float(a) in last}
     assert steps == {1}
 
 
@@ -76,7 +76,7 @@ def test_official_starts() -> None:
     transitions, _ = record(TASK, 2, 120)
     replay = ring.init(Spec(2, 1, 2), 500)
     for transition in transitions:
-        replay = jax.jit(ring.append, static_argnames="whole")(replay, transition, whole=3)
+        replay = jax.jit(ring.append, static_argnames="min_episode_steps")(replay, transition, min_episode_steps=3)
     windows = draw(replay, 20_000, 2, 3)
     assert int(windows.lead.min()) == 3
     complete = [t for t in transitions if t.obs[0] <= t.obs[1] - 3]
@@ -117,7 +117,7 @@ def test_view_ahead_is_the_next_view() -> None:
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     checked = 0
     for i, action in enumerate(np.asarray(windows.action[:, delay, 0]).tolist()):
-        later = by_action[action] + int(windows.steps[i])
+        later = by_action[action] + int(windows.n_step[i])
         if later < len(shown) and not transitions[later - 1].done:
             np.testing.assert_array_equal(views.obs[i], shown[later].obs)
             np.testing.assert_array_equal(views.actions[i], shown[later].actions)

@@ -11,7 +11,7 @@ import pytest
 from delayrl import train
 from delayrl.agents.registry import AGENTS
 from delayrl.core.types import Spec
-from delayrl.training.buffers import LARGE, keep_memory, product_bytes
+from delayrl.training.buffers import LARGE, keep_buffers, product_bytes
 
 FAULTS = """
 import resource, sys
@@ -19,7 +19,7 @@ import delayrl.training.buffers
 from delayrl.agents.registry import AGENTS
 from delayrl.core.types import Spec
 if sys.argv[1] == "kept":
-    delayrl.training.buffers.keep_memory(AGENTS["vdpo"].presets["paper"].agent, Spec(17, 6, 5), 1)
+    delayrl.training.buffers.keep_buffers(AGENTS["vdpo"].presets["paper"].agent, Spec(17, 6, 5), 1)
 import jax, jax.numpy as jnp
 large = jax.jit(lambda x: jnp.sort(jnp.outer(x, x), 0).sum(0))
 x = jnp.ones(3500)  # 49 MB in between
@@ -54,7 +54,7 @@ def test_what_is_large() -> None:
     assert max(product_bytes(paper, Spec(17, 6, 5))) > LARGE
     assert max(product_bytes(small, Spec(17, 6, 5))) < LARGE / 2
     assert max(product_bytes(AGENTS["sac"].presets["paper"].agent, Spec(17, 6, 0))) < LARGE / 2
-    assert not keep_memory(AGENTS["random"].presets["small"].agent, Spec(17, 6, 0), 8)  # it learns nothing
+    assert not keep_buffers(AGENTS["random"].presets["small"].agent, Spec(17, 6, 0), 8)  # it learns nothing
 
 
 @pytest.mark.skipif(not glibc() or huge_pages(), reason="of glibc 2.35 and newer, with pages of 4 KB")
@@ -70,11 +70,11 @@ import json, sys
 import delayrl.training.buffers, delayrl.training.train
 from jax._src import xla_bridge
 delayrl.training.buffers.LARGE = 0
-keep = delayrl.training.train.keep_memory
+keep = delayrl.training.train.keep_buffers
 def first(*args):
     assert not xla_bridge.backends_are_initialized()  # else JAX does not read the setting
     return keep(*args)
-delayrl.training.train.keep_memory = first
+delayrl.training.train.keep_buffers = first
 from delayrl import train
 train("sac", "Pendulum-v1", preset="small", out=sys.argv[1], **json.loads(sys.argv[2]))
 import jax

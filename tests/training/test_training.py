@@ -20,7 +20,6 @@ from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
-from delayrl.training.train import Session
 from short_runs import arrays, train
 
 
@@ -436,8 +435,7 @@ def test_official_protocol(tmp_path: Path) -> None:
     assert {row["reset_seed"] for row in rows} == {0}
     assert {row["protocol"] for row in rows} == {"official"}
     assert len({row["return"] for row in rows if row["step"] == 100}) == 2  # the first actions differ
-    actor = Actor(make("Reacher-v5", 3, rescale=True), 7, privileged=False, official=True)
-    actor.reset()
+    actor = Actor(make("Reacher-v5", 3, rescale=True), 7, privileged=False, protocol=OFFICIAL)
     first = actor.truth
     steps = [actor.step(np.zeros(2, np.float32)) for _ in range(50)]
     assert steps[-1].done
@@ -456,13 +454,11 @@ def test_options_round_trip() -> None:
 def test_unprivileged_agents_are_not_given_the_truth(agent: str) -> None:
     preset = AGENTS[agent].presets["small"]
     delay = as_delay(0 if agent == "sac" else 3)
-    session = Session(preset.agent, preset.schedule, "Reacher-v5", delay, [0])
-    actor = session.actors[0]
-    actor.reset()
+    actor = Actor(make("Reacher-v5", delay, rescale=True), 0, preset.agent.privileged)
     for _ in range(5):
         actor.step(np.zeros(2, np.float32))
     assert (actor.seen.truth is not None) == preset.agent.privileged
-    assert session._hidden()[0] == (0 if preset.agent.privileged else actor.seen.age)
+    assert hidden_steps(actor, delay) == (0 if preset.agent.privileged else actor.seen.age)
 
 
 @pytest.mark.parametrize(
@@ -494,7 +490,6 @@ def test_unknown_agent() -> None:
 def test_training_shows_what_the_wrapper_shows() -> None:
     """Actions are stored as they were executed: the history that the actor sees is in [-1, 1], bit for bit."""
     actor = Actor(make("Pusher-v5", 3, rescale=True), 0, privileged=False)
-    actor.reset()
     rng = np.random.default_rng(0)
     actions = [rng.uniform(-1, 1, 7).astype(np.float32) for _ in range(5)]
     for action in actions:

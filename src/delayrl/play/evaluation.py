@@ -1,4 +1,4 @@
-"""Evaluation: deterministic actions, a start state of its own for every episode, one row per episode, never a mean."""
+"""Evaluation: deterministic actions, a start state for each episode, one row for each episode and never a mean."""
 
 import functools
 import itertools
@@ -30,15 +30,15 @@ class Episodes(NamedTuple):
 
 
 class Evaluator:
-    """Plays episodes of all seeds beside each other, one call of the policy for each step of all of them.
+    """Plays episodes of all seeds beside each other, with one call of the policy for each step of all of them.
 
     Args:
         agent: whose policy is played.
         spec: the task as the agent was trained on it.
         env: id of the task.
-        delay: under which it is played; its maximum must not be longer than `spec.delay`. A text or number for `make`.
+        delay: under which it is played, no longer than `spec.delay`. A text or number for `make`.
         seeds: length of the seed axis of the states.
-        episodes: how many for each.
+        episodes: how many for each seed.
         apply: `map`, or that of a pool of threads, which steps the environments beside each other.
     """
 
@@ -52,9 +52,9 @@ class Evaluator:
         episodes: int,
         apply: Callable[..., Iterator[Any]] = map,
     ) -> None:
-        late = servable(env, delay, spec)
+        served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
-        self._envs = [[make(env, late, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
         self._act = _compiled_act(agent)
 
     def __call__(
@@ -63,11 +63,19 @@ class Evaluator:
         reset_seeds: Sequence[Sequence[int]],
         keys: Key,
         first: NDArray[np.float32] | None = None,
-        travel: Sequence[Sequence[int]] | None = None,
+        travel_seeds: Sequence[Sequence[int]] | None = None,
     ) -> Episodes:
-        """Play one episode from each reset seed, [seeds, episodes].
+        """Play one episode from each reset seed.
 
-        With `first` for the first actions, [.., .., A], and travel times from the seeds `travel`, if these are given.
+        Args:
+            states: the agents, with a seed axis.
+            reset_seeds: of the start states, [seeds, episodes].
+            keys: of the seeds; for policies that sample.
+            first: the first actions, [seeds, episodes, A], if they are not the policy's.
+            travel_seeds: of the travel times, [seeds, episodes], if they are not those of the start states.
+
+        Raises:
+            DelayRLError: a reward or an observation that is not finite.
         """
         shape = (len(self._envs), len(self._envs[0]))
         returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
@@ -75,7 +83,7 @@ class Evaluator:
             [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
-        for envs, seeds in zip(self._envs, travel or (), strict=False):
+        for envs, seeds in zip(self._envs, travel_seeds or (), strict=False):
             for env, seed in zip(envs, seeds, strict=True):
                 env.draw_from(seed)
         step = 0
@@ -105,42 +113,42 @@ class Evaluator:
 
 
 def servable(env: str, delay: int | str | Delay, spec: Spec) -> Delay:
-    """The delay without that of rewards; DelayRLError where its ages are longer than a policy was trained for."""
-    late = delay_of(env, delay).acted()
-    if late.maximum > spec.delay:
-        raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {late.maximum}")
-    return late
+    """Return the delay without that of rewards. Raises DelayRLError if it is longer than a policy was trained for."""
+    served = delay_of(env, delay).acted()
+    if served.maximum > spec.delay:
+        raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {served.maximum}")
+    return served
 
 
 @functools.cache
 def _compiled_act(agent: Agent) -> Any:
     """Deterministic actions for [seeds, episodes], each with a key of its own."""
 
-    def one(state: State, seen: Seen, key: Key, step: Array, episode: Array) -> Action:
+    def act(state: State, seen: Seen, key: Key, step: Array, episode: Array) -> Action:
         for number in (step, episode):
             key = jax.random.fold_in(key, number)
         return agent.act(state, seen, key, explore=False)
 
-    def episodes(state: State, seen: Seen, key: Key, step: Array) -> Action:
+    def act_in_episodes(state: State, seen: Seen, key: Key, step: Array) -> Action:
         numbers = jnp.arange(seen.age.shape[0])
-        return jax.vmap(one, (None, 0, None, None, 0))(state, seen, key, step, numbers)
+        return jax.vmap(act, (None, 0, None, None, 0))(state, seen, key, step, numbers)
 
-    return jax.jit(jax.vmap(episodes, (0, 0, 0, None)))
+    return jax.jit(jax.vmap(act_in_episodes, (0, 0, 0, None)))
 
 
 def check_seed(seed: int) -> None:
-    """Seeds are whole numbers from 0 to 2³¹ - 1."""
+    """Raise DelayRLError unless a seed is a whole number from 0 to 2³¹ - 1."""
     if not 0 <= seed < 2**31:
         raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed}")
 
 
 def reset_seed(seed: int, *stream: int) -> int:
-    """A seed for one episode: the same numbers give the same seed, others an unrelated one."""
+    """Return a seed for one episode: the same numbers give the same seed, others an unrelated one."""
     return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0] >> 1)
 
 
 TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
-"""Streams of `reset_seed`: start states of evaluation are none of training's, those of `evaluate` none of either."""
+"""Streams of `reset_seed`: training, evaluation and `evaluate` share no start states."""
 
 
 def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None, seed: int = 0) -> dict[str, Any]:
@@ -163,7 +171,7 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None
 
 
 def sweep(run: str | Path, episodes: int = 10, seed: int = 0) -> Iterator[dict[str, Any]]:
-    """`evaluate` at every constant delay from 0 to the longest age that the policy was trained for."""
+    """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
     policy, config = load(run), Run(Path(run)).config
     for delay in range(policy.spec.delay + 1):
         yield _play(policy, config, delay, episodes, seed)
@@ -173,8 +181,8 @@ def _play(policy: Policy, config: dict[str, Any], delay: int | str, episodes: in
     if episodes < 1:
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
     check_seed(seed)
-    late = delay_of(config["env"], delay)
-    evaluator = Evaluator(policy.agent, policy.spec, config["env"], late, 1, episodes)
+    parsed = delay_of(config["env"], delay)
+    evaluator = Evaluator(policy.agent, policy.spec, config["env"], parsed, 1, episodes)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
     with jax.default_matmul_precision("float32"):  # a GPU's own is coarser
@@ -182,7 +190,7 @@ def _play(policy: Policy, config: dict[str, Any], delay: int | str, episodes: in
     return {
         "agent": config["agent"],
         "env": config["env"],
-        "delay": late.label(),
+        "delay": parsed.label(),
         "episodes": episodes,
         "mean_return": float(returns.mean()),
         "std_return": float(returns.std()),

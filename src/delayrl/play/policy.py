@@ -1,4 +1,4 @@
-"""A trained policy, for use: `load` a run, then `act` on what the wrapper shows."""
+"""Trained policies: `load` a run, then `act` on what the wrapper shows."""
 
 from pathlib import Path
 from typing import Any
@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State, template
-from delayrl.agents.registry import AGENTS
 from delayrl.core.types import Spec
 from delayrl.core.views import seen_now
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
-from delayrl.run.configuration import check_names, override
-from delayrl.run.folder import Checkpoint, Run, restore_tree
+from delayrl.run.arrays import restore_tree
+from delayrl.run.checkpoint import Checkpoint
+from delayrl.run.condition import agent_of
+from delayrl.run.folder import Run
 
 
 class Policy:
@@ -34,7 +35,7 @@ class Policy:
         self._act = jax.jit(lambda state, seen, key: agent.act(state, seen, key, explore=False))
 
     def act(self, obs: NDArray[Any], info: dict[str, Any]) -> NDArray[np.float32]:
-        """The deterministic action, in the task's own units.
+        """Return the deterministic action, in the task's own units.
 
         Args:
             obs: the newest observation that has arrived, [S].
@@ -59,7 +60,7 @@ class Policy:
 
 
 def load(path: str | Path) -> Policy:
-    """The policy of a run folder, from its newest good checkpoint.
+    """Load the policy of a run folder from its newest good checkpoint.
 
     Raises:
         DelayRLError: no run folder, no good checkpoint, or one of another agent.
@@ -70,7 +71,7 @@ def load(path: str | Path) -> Policy:
 
 
 def restored(config: dict[str, Any], checkpoint: Checkpoint) -> Policy:
-    """The policy in a checkpoint of a run with this configuration."""
+    """Load the policy in a checkpoint of a run with this configuration."""
     agent = agent_of(config)
     env = make(config["env"], config["delay"])
     spec = spec_of(env)
@@ -79,16 +80,6 @@ def restored(config: dict[str, Any], checkpoint: Checkpoint) -> Policy:
     return Policy(agent, state, spec, env.action_space.low, env.action_space.high)  # type: ignore[attr-defined]
 
 
-def agent_of(config: dict[str, Any]) -> Agent:
-    """The agent that a run's configuration describes."""
-    try:
-        agent = AGENTS[config["agent"]].presets[config["preset"]].agent
-        check_names(config["hyperparameters"], agent)
-        return override(agent, config["hyperparameters"])  # type: ignore[no-any-return]
-    except KeyError as error:
-        raise DelayRLError(f"the run's configuration names an unknown agent or preset: {error}") from error
-
-
 def spec_of(env: Any) -> Spec:
-    """Sizes and longest age of a wrapped task."""
+    """Return the sizes and the longest age of a wrapped task."""
     return Spec(env.observation_space.shape[0], env.action_space.shape[0], env.history)

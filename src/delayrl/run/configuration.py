@@ -20,7 +20,7 @@ class Option:
     bounds: tuple[float, float] = (-math.inf, math.inf)
 
     def check(self, value: Any) -> Any:
-        """The value, in this option's type; DelayRLError where it does not fit."""
+        """Return the value in this option's type. Raises DelayRLError if it does not fit."""
         if get_origin(self.kind) is Literal:
             if value not in get_args(self.kind):
                 raise DelayRLError(f"{self.name} must be one of {', '.join(get_args(self.kind))}; got {value!r}")
@@ -44,7 +44,7 @@ class Option:
 
 
 def options(config: Any) -> Iterator[Option]:
-    """Every option of a dataclass, those of dataclasses inside it included; what is marked `fixed` is no option."""
+    """Yield every option of a dataclass and of the dataclasses inside it, but not the fields marked `fixed`."""
     hints = get_type_hints(type(config), include_extras=True)
     for field in fields(config):
         value, hint = getattr(config, field.name), hints[field.name]
@@ -56,7 +56,7 @@ def options(config: Any) -> Iterator[Option]:
 
 
 def override(config: Any, values: Mapping[str, Any]) -> Any:
-    """The dataclass with some of its options replaced; names that it does not have are left alone."""
+    """Return the dataclass with some of its options replaced. Names that it does not have are ignored."""
     changes: dict[str, Any] = {}
     known = {option.name: option for option in options(config)}
     for field in fields(config):
@@ -69,7 +69,7 @@ def override(config: Any, values: Mapping[str, Any]) -> Any:
 
 
 def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) -> None:
-    """DelayRLError, with the nearest names, for a name that is no option of the dataclasses and not among `also`."""
+    """Raise DelayRLError, with the nearest names, for a name that is no option of the dataclasses nor among `also`."""
     known = [option.name for config in configs for option in options(config)] + list(also)
     for name in values:
         if name not in known:
@@ -79,5 +79,5 @@ def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) 
 
 
 def values_of(config: Any) -> dict[str, Any]:
-    """All options by name: what `override` would need to rebuild it."""
+    """Return all options by name: what `override` needs to rebuild the dataclass."""
     return {option.name: list(o) if isinstance(o := option.default, tuple) else o for option in options(config)}

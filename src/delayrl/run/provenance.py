@@ -1,4 +1,4 @@
-"""What a result depends on besides the configuration: versions of the libraries, and the hardware."""
+"""What a result depends on besides its configuration: versions of libraries, the commit, the hardware."""
 
 import os
 import platform
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 
 def commit() -> str | None:
-    """The commit of the checkout that the package lies in, marked where it has been changed; None outside of one.
+    """Return the commit of the checkout that the package lies in, marked if files differ from it; else None.
 
     A package that is installed into a folder of another project's checkout is not in that checkout.
     """
@@ -32,16 +32,16 @@ def commit() -> str | None:
 
 
 def versions() -> dict[str, Any]:
-    """Versions of Python and of the libraries that results depend on, and the device in words."""
-    found: dict[str, Any] = {"python": platform.python_version()}
+    """Return the versions of Python and of the libraries that results depend on, and the device in words."""
+    used: dict[str, Any] = {"python": platform.python_version()}
     for package in ("delayrl", "gymnasium", "jax", "jaxlib", "mujoco", "numpy", "optax"):
         try:
-            found[package] = version(package)
+            used[package] = version(package)
         except PackageNotFoundError:
-            found[package] = None
-    found["commit"] = commit()
+            used[package] = None
+    used["commit"] = commit()
     (device,) = jnp.zeros(()).devices()  # where arrays are made now, which `--device cpu` changes
-    found["device"] = device.device_kind
-    found["cores"] = os.cpu_count()
-    found["machine"] = f"{platform.system()} {platform.machine()}"
-    return found
+    used["device"] = device.device_kind
+    used["cores"] = os.cpu_count()
+    used["machine"] = f"{platform.system()} {platform.machine()}"
+    return used

@@ -21,7 +21,7 @@ class Learner(NamedTuple):
     replay: ring.Replay
 
 
-Hidden = Int[Array, ""] | NDArray[np.int32] | np.int32
+Hidden = Int[Array, "*seeds"] | NDArray[np.int32] | np.int32
 """How many of the newest observations a learner may not use yet, because they have not all arrived."""
 
 
@@ -47,7 +47,7 @@ class Program:
         self.phases, self._agent, self._spec = agent.phases(), agent, spec
         self._append = functools.partial(ring.append, min_episode_steps=min_episode_steps)
         self._jitted_act = jax.jit(self._act)
-        self._jitted_learn = jax.jit(self._learn, static_argnames="index", donate_argnums=0)
+        self._jitted_learn = jax.jit(self._learn, static_argnames="first_phase", donate_argnums=0)
         self._jitted_update = jax.jit(self._update, static_argnames="index", donate_argnums=0)
 
     def init(self, keys: Key, capacity: int) -> Learner:
@@ -79,14 +79,16 @@ class Program:
         """
         steps = range(last - len(pending) + 1, last + 1)
         due = [self._due(step) if step >= random_steps else [] for step in steps]
-        always = 0 if all(0 in phases for phases in due) else None
+        first_phase = all(0 in phases for phases in due)
         flat = [stored for seeds in pending for stored in seeds]
         shape = (len(steps), len(pending[0]))
         block = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *flat)
-        learner, metrics = self._jitted_learn(learner, block, keys, np.array(steps, np.int32), index=always)
+        learner, metrics = self._jitted_learn(learner, block, keys, np.array(steps, np.int32), first_phase=first_phase)
         for step, phases in zip(steps, due, strict=True):
-            for index in (phase for phase in phases if phase != always):
-                learner, more = self._jitted_update(learner, block.hidden[-1], keys, np.int32(step), index=index)
+            for index in phases[1:] if first_phase else phases:
+                learner, more = self._jitted_update(
+                    learner, block.hidden[-1], keys, np.int32(step), index=index
+                )
                 metrics = metrics | more
         return learner, metrics, any(due)
 
@@ -100,14 +102,14 @@ class Program:
         return jax.vmap(act)(agent, seen, keys)
 
     def _learn(
-        self, learner: Learner, block: Stored, keys: Key, steps: Int[Array, " block"], index: int | None
+        self, learner: Learner, block: Stored, keys: Key, steps: Int[Array, " block"], first_phase: bool
     ) -> tuple[Learner, Metrics]:
         def learn_step(learner: Learner, x: tuple[Stored, Int[Array, ""]]) -> tuple[Learner, Metrics]:
             (transition, hidden), step = x
             replay = jax.vmap(self._append)(learner.replay, transition)
             # else the write is fused into the gathers of `sample`, and the whole replay is copied at every step
             learner = learner._replace(replay=jax.lax.optimization_barrier(replay))
-            return (learner, {}) if index is None else self._update(learner, hidden, keys, step, index)
+            return self._update(learner, hidden, keys, step, 0) if first_phase else (learner, {})
 
         if len(steps) == 1:
             return learn_step(learner, jax.tree.map(lambda x: x[0], (block, steps)))
@@ -115,7 +117,7 @@ class Program:
         return learner, jax.tree.map(lambda x: x.mean(0), metrics)
 
     def _update(
-        self, learner: Learner, hidden: Int[Array, " seeds"], keys: Key, step: Int[Array, ""], index: int
+        self, learner: Learner, hidden: Hidden, keys: Key, step: Int[Array, ""], index: int
     ) -> tuple[Learner, Metrics]:
         agent, replay = learner
         phase = self.phases[index]

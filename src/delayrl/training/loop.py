@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from delayrl.core.types import Metrics
+from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, StoppedError
 from delayrl.play.evaluation import RANDOM_ACTIONS
 from delayrl.play.plots import curve
@@ -102,7 +103,7 @@ class Loop:
         transitions = self.group.apply(Actor.step, state.actors, actions)
         state.pending.append(
             [
-                Stored(transition, self._hidden(actor))
+                Stored(transition, hidden_steps(actor, self.group.setup.delay))
                 for transition, actor in zip(transitions, state.actors, strict=True)
             ]
         )
@@ -145,13 +146,13 @@ class Loop:
         size = self.group.spec.action_size
         return np.stack([generator.uniform(-1, 1, size).astype(np.float32) for generator in generators])
 
-    def _hidden(self, actor: Actor) -> np.int32:
-        """How many of the newest steps a seed's learner may not use, because not all of them have arrived.
 
-        What is older than the longest delay has arrived, even if it was overtaken.
-        """
-        if actor.privileged:
-            return np.int32(0)
-        delay = self.group.setup.delay
-        longest = delay.action.maximum + max(delay.observation.maximum, delay.reward.maximum)
-        return np.int32(min(len(actor.actions), longest))
+def hidden_steps(actor: Actor, delay: Delay) -> np.int32:
+    """Return how many of the newest steps a seed's learner may not use yet, because not all of them have arrived.
+
+    What is older than the longest delay has arrived, even if it was overtaken. A privileged learner may use all.
+    """
+    if actor.privileged:
+        return np.int32(0)
+    longest = delay.action.maximum + max(delay.observation.maximum, delay.reward.maximum)
+    return np.int32(min(len(actor.actions), longest))
