@@ -1,7 +1,7 @@
-"""Collect runs into one file of rows that can be committed: `python benchmarks/collect.py OUT.jsonl RUN [RUN …]`.
+"""Collect runs into one file of rows to commit: `python benchmarks/collect.py OUT.jsonl RUN [RUN …]`.
 
-Each run is a line with its configuration and versions, then a line for each of its evaluation episodes; with
---episodes N also N episodes on start states that the run never saw (`delayrl evaluate`). Nothing is written by hand.
+Each run takes one line with its configuration and versions, then one line for each evaluation episode. `--episodes N`
+adds N episodes on start states that the run never saw (`delayrl evaluate`).
 """
 
 import argparse
@@ -15,7 +15,7 @@ KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
 
 
 def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = False) -> None:
-    """Write the rows of run folders into one file."""
+    """Write the rows of run folders into one file, with new evaluations if `episodes` is not 0."""
     lines = []
     for number, path in enumerate(runs):
         run = Run(path)
@@ -32,12 +32,12 @@ def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = 
 
 
 def main() -> None:
-    """Read the command line."""
+    """Collect the runs that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--episodes", type=int, default=0, help="also evaluate each run on so many unseen start states")
-    parser.add_argument("--every-delay", action="store_true", help="these at every delay that the policy serves, too")
+    parser.add_argument("--episodes", type=int, default=0, help="also evaluate on this many unseen start states")
+    parser.add_argument("--every-delay", action="store_true", help="also evaluate at every delay the policy serves")
     given = parser.parse_args()
     collect(given.out, given.runs, given.episodes, given.every_delay)
 

@@ -1,4 +1,4 @@
-"""Pictures and tables of the docs, from committed rows alone: `python benchmarks/figures.py`."""
+"""Write the pictures and tables of the docs from committed rows alone: `python benchmarks/figures.py`."""
 
 import json
 import runpy
@@ -24,18 +24,18 @@ COLOURS = {
     "a-sac": "#9a6700",
 }
 
-Curves = dict[str, dict[int, list[float]]]  # label -> step -> one mean return a seed
+Curves = dict[str, dict[int, list[float]]]  # label -> step -> one mean return per seed
 
 
 def read(name: str) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
-    """Configurations by run, rows, and evaluations of a results file."""
+    """Return configurations by run, rows, and evaluations of a results file."""
     lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
     configs = {line["run"]: line["config"] for line in lines if "config" in line}
     return configs, [line for line in lines if "step" in line], [line for line in lines if "evaluation" in line]
 
 
 def curves(name: str) -> Curves:
-    """Mean return of each seed's evaluations, by agent; the reference of vdpo beside it."""
+    """Return the mean returns of each seed's evaluations, by agent; VDPO's reference has a label of its own."""
     configs, rows, _ = read(name)
     episodes: dict[tuple[str, int, int], list[float]] = defaultdict(list)
     for row in rows:
@@ -49,7 +49,7 @@ def curves(name: str) -> Curves:
 
 
 def draw(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
-    """Return against steps: the mean over seeds as a line, each seed as a thin one."""
+    """Draw return against steps: a line for the mean over seeds, a thin line for each seed."""
     figure, axes = pyplot.subplots(figsize=(7.5, 4), layout="constrained")
     for label, points in curves(name).items():
         if label not in labels:
@@ -69,7 +69,7 @@ def draw(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
 
 
 def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any]]]]:
-    """(configuration, evaluation on unseen start states) of each run, by agent."""
+    """Return (configuration, evaluation on unseen start states) of each run, by agent."""
     configs, _, lines = read(name)
     result: dict[str, list[tuple[dict[str, Any], dict[str, Any]]]] = defaultdict(list)
     for line in lines:
@@ -78,13 +78,13 @@ def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any
 
 
 def table(name: str) -> str:
-    """Markdown: each agent's returns on start states that it never saw, seed by seed, and between its anchors."""
-    found = evaluations(name)
-    means = {agent: [e["mean_return"] for _, e in runs] for agent, runs in found.items()}
+    """Return a Markdown table of each agent's returns on unseen start states, by seed and normalised."""
+    by_agent = evaluations(name)
+    means = {agent: [e["mean_return"] for _, e in runs] for agent, runs in by_agent.items()}
     anchors = "sac" in means and "random" in means
     lines = ["| agent | delay | steps | mean return | each seed |" + (" normalised |" if anchors else "")]
     lines.append("| --- | --- | --- | --- | --- |" + (" --- |" if anchors else ""))
-    for agent, runs in sorted(found.items(), key=lambda item: -np.mean(means[item[0]])):
+    for agent, runs in sorted(by_agent.items(), key=lambda item: -np.mean(means[item[0]])):
         config, evaluation = runs[0]
         seeds = " · ".join(f"{mean:.1f}" for mean in means[agent])
         cells = [
@@ -102,15 +102,15 @@ def table(name: str) -> str:
 
 
 def draw_against_delay(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
-    """What the same policies return at every delay that they serve: mean over seeds, each seed as a thin line."""
+    """Draw return against delay for the same policies: the mean over seeds, and a thin line for each seed."""
     lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
-    found: dict[str, dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
+    returns: dict[str, dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
     for line in lines:
         if "sweep" in line and line["sweep"]["agent"] in labels:
             result = line["sweep"]
-            found[result["agent"]][line["run"]][result["delay"]] = result["mean_return"]
+            returns[result["agent"]][line["run"]][result["delay"]] = result["mean_return"]
     figure, axes = pyplot.subplots(figsize=(7.5, 4), layout="constrained")
-    for agent, runs in found.items():
+    for agent, runs in returns.items():
         delays = sorted(next(iter(runs.values())))
         seeds = np.array([[run[delay] for delay in delays] for run in runs.values()])
         axes.plot(delays, seeds.T, color=COLOURS[agent], alpha=0.25, linewidth=1)
@@ -125,7 +125,7 @@ def draw_against_delay(name: str, title: str, out: Path, labels: dict[str, str])
 
 
 def provenance(name: str) -> str:
-    """One line: on what the rows were made."""
+    """Return one line on the machine, versions and settings behind the rows."""
     configs, _, lines = read(name)
     versions = configs[0]["versions"]
     commits = sorted({config["versions"]["commit"] or "?" for config in configs.values()})
@@ -140,7 +140,7 @@ def provenance(name: str) -> str:
 
 
 def overhead() -> str:
-    """Markdown: what the wrappers cost."""
+    """Return a Markdown table of what the wrappers cost."""
     first, *lines = [json.loads(line) for line in (HERE / "results" / "overhead.jsonl").read_text().splitlines()]
     rows = ["| wrapper, delay | environments | ratio of times | quartiles |", "| --- | --- | --- | --- |"]
     for line in lines:
@@ -157,7 +157,7 @@ def overhead() -> str:
 
 
 def udp_table(lines: list[dict[str, Any]]) -> str:
-    """Markdown: each network and controller of the UDP demonstration, over its episodes."""
+    """Return a Markdown table of the UDP demonstration: each network and controller over its episodes."""
     head, rows = lines[0], [line for line in lines if "statistics" in line]
     table = [
         "| observations | policy | mean return | worst | age (steps) | overruns |",
@@ -166,14 +166,14 @@ def udp_table(lines: list[dict[str, Any]]) -> str:
     for row in rows:
         key = (row["scenario"], row["controller"])
         played = [line for line in lines if "return" in line and (line["scenario"], line["controller"]) == key]
-        returns, found = [episode["return"] for episode in played], row["statistics"]
-        age = "–" if found["age_mean"] is None else f"{found['age_mean']:.2f} ± {found['age_std']:.2f}"
+        returns, statistics = [episode["return"] for episode in played], row["statistics"]
+        age = "–" if statistics["age_mean"] is None else f"{statistics['age_mean']:.2f} ± {statistics['age_std']:.2f}"
         words = {
             "delayed": "with its history",
             "deaf": "the same, not told which commands were lost",
             "blind": "blind to the delay",
         }[row["controller"]]
-        overruns = f"{found['overruns']:,} of {found['decisions']:,}"
+        overruns = f"{statistics['overruns']:,} of {statistics['decisions']:,}"
         held = f"; {sum(episode['held'] for episode in played):,} actions too late" if row["real_time"] else ""
         cells = [row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held]
         table.append("| " + " | ".join(cells) + " |")
@@ -188,7 +188,7 @@ def udp_table(lines: list[dict[str, Any]]) -> str:
 
 
 def overruns_table(lines: list[dict[str, Any]]) -> str:
-    """Markdown: mean returns under networks that are slower than was trained, by the answer to it."""
+    """Return a Markdown table of mean returns on links slower than the trained delay, by the answer to it."""
     policy, versions, rows = lines[0]["policy"], lines[0]["versions"], lines[1:]
     table = ["| travel time, steps | `clip` | `hold` | the last Δ actions |", "| --- | --- | --- | --- |"]
     for i in range(0, len(rows), 3):
@@ -207,7 +207,7 @@ def overruns_table(lines: list[dict[str, Any]]) -> str:
 
 
 def insert(page: Path, key: str, text: str) -> None:
-    """Put generated text between `<!-- key -->` and `<!-- /key -->`."""
+    """Replace the text between `<!-- key -->` and `<!-- /key -->` in a page."""
     content = page.read_text()
     begin, end = f"<!-- {key} -->", f"<!-- /{key} -->"
     head, rest = content.split(begin)
@@ -215,7 +215,7 @@ def insert(page: Path, key: str, text: str) -> None:
 
 
 def first(root: Path) -> str:
-    """The report of the grid `first`, into docs/results; of it, what the README shows."""
+    """Write the report of the grid `first` to docs/results and return the part that the README shows."""
     folder = root / "docs" / "results"
     bench(["report", str(HERE / "results" / "first.sqlite"), "--out", str(folder)])
     text = (folder / "report.md").read_text()
@@ -225,17 +225,16 @@ def first(root: Path) -> str:
 
 
 def main() -> None:
-    """Everything that the docs show."""
+    """Write every generated picture and section of the docs."""
     root = HERE.parent
     images = root / "docs" / "img"
-    late = "delay 5"
     words = {
-        "vdpo": f"VDPO, {late}",
+        "vdpo": "VDPO, delay 5",
         "reference": "its reference, no delay",
-        "sac-memoryless": f"SAC without memory, {late}",
+        "sac-memoryless": "SAC without memory, delay 5",
     }
     draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", words)
-    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | {"bpql": f"BPQL, {late}"})
+    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | {"bpql": "BPQL, delay 5"})
     if (HERE / "results" / "pusher-random.jsonl").exists():
         labels = {agent: agent for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
         title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"

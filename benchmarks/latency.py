@@ -1,9 +1,9 @@
-"""How long one decision takes, for the docs: `python benchmarks/latency.py` measures, writes rows and the table.
+"""Measure how long one decision takes and write the table in the docs: `python benchmarks/latency.py`.
 
-Bundles of the preset `paper` at HalfCheetah-v5's sizes (17 observations, 6 actions, 50 ms a step), with weights as they
-are at the start of a run: their values do not change the time. Several tries one after the other, each backend in a
-process of its own on one thread of one core; the spread over the tries is what the machine's other work makes of it.
-`--table` only writes the table again, from the rows.
+The bundles have the preset `paper` and the sizes of HalfCheetah-v5 (17 observations, 6 actions, 50 ms per step). Their
+weights are untrained, because values do not change the time. Tries run one after another, each backend in its own
+process on one thread of one core. The spread over the tries is due to other work on the machine.
+`--table` only rewrites the table from the rows.
 """
 
 import argparse
@@ -35,7 +35,7 @@ WORDS = {"numpy": "NumPy", "onnx": "ONNX Runtime", "jax": "JAX", "cpp": "C++ exa
 
 
 def build(folder: Path, name: str, delay: int) -> Path:
-    """A bundle of fresh weights."""
+    """Write a bundle with untrained weights and return its folder."""
     agent, spec = AGENTS[name].presets["paper"].agent, Spec(*SIZES, delay)
     policy = Policy(agent, agent.init(spec, jax.random.key(0)), spec, -np.ones(SIZES[1]), np.ones(SIZES[1]))
     write_files(out := folder / f"{name}-{delay}", bundle_files(policy, {"agent": name, "dt": DT}))
@@ -43,7 +43,7 @@ def build(folder: Path, name: str, delay: int) -> Path:
 
 
 def in_cpp(program: Path, bundle: Path, delay: int, decisions: int) -> dict[str, Any]:
-    """The C++ example's own clock, pinned to one core."""
+    """Measure with the C++ example's own clock, pinned to one core."""
     pin = ["taskset", "-c", str(max(os.sched_getaffinity(0)))] if shutil.which("taskset") else []
     command = [*pin, str(program), str(bundle), "--latency", str(decisions), str(delay)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -51,7 +51,7 @@ def in_cpp(program: Path, bundle: Path, delay: int, decisions: int) -> dict[str,
 
 
 def measure(tries: int, decisions: int) -> None:
-    """All rows anew."""
+    """Measure every backend on every bundle and write the rows."""
     package = versions()
     try:
         import onnxruntime
@@ -85,18 +85,18 @@ def measure(tries: int, decisions: int) -> None:
 
 
 def table() -> str:
-    """Markdown: medians over the tries, with the lowest and highest beside them."""
+    """Return a Markdown table: medians over the tries, with the lowest and highest values."""
     head, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
     lines = ["| policy | Δ | backend | p50 ms | p99 ms | max ms | p99 of processor time, ms |", "|" + " --- |" * 7]
     for name in NAMES:
         for delay in DELAYS:
             for backend in WORDS:
-                found = [r for r in rows if (r["agent"], r["delay"], r["backend"]) == (name, delay, backend)]
-                if not found:
+                measured = [r for r in rows if (r["agent"], r["delay"], r["backend"]) == (name, delay, backend)]
+                if not measured:
                     continue
                 cells = [f"`{name}`", delay, WORDS[backend]]
                 for key in KEYS:
-                    values = [row[key] for row in found]
+                    values = [row[key] for row in measured]
                     cells.append(f"{np.median(values):.2f} ({min(values):.2f}–{max(values):.2f})")
                 lines.append("| " + " | ".join(map(str, cells)) + " |")
     package, tries = head["versions"], 1 + max(row["try"] for row in rows)
@@ -115,11 +115,11 @@ def table() -> str:
 
 
 def main() -> None:
-    """Read the command line."""
+    """Measure unless `--table` is given, then write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tries", type=int, default=5)
     parser.add_argument("--decisions", type=int, default=2000)
-    parser.add_argument("--table", action="store_true", help="only write the table again, from the rows")
+    parser.add_argument("--table", action="store_true", help="only rewrite the table from the rows")
     given = parser.parse_args()
     if not given.table:
         measure(given.tries, given.decisions)

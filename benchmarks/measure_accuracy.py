@@ -1,8 +1,7 @@
-"""How well `delayrl measure LOG` finds known delays: `python benchmarks/measure_accuracy.py`, some minutes.
+"""Test how well `delayrl measure LOG` recovers known delays: `python benchmarks/measure_accuracy.py`, some minutes.
 
-Writes one row for each log to results/measure.jsonl, and from these rows the tables of docs/measure.md (--tables: only
-those).
-A log is a CSV file, read as a person's would be. The delay is a whole number of rows, 0 to 11.
+Writes one row for each log to results/measure.jsonl, and from these rows the tables of docs/measure.md. `--tables` only
+writes the tables. A log is a CSV file, read like a user's. The delay is a whole number of rows, 0 to 11.
 """
 
 import argparse
@@ -29,12 +28,12 @@ PLANTS = ("gain", "integrator", "servo", "second order")
 COMMANDS = ("white", "smooth", "held", "policy")
 NOISES = (0.0, 0.01, 0.03, 0.1)
 TASKS = ("HalfCheetah-v5", "Hopper-v5", "Reacher-v5", "Ant-v5", "Pendulum-v1")
-WIDE = 4.5  # rows, of an interval at which the command warns
+WIDE = 4.5  # rows; the command warns about wider intervals
 METHODS = ("dead time", "increments", "levels")
 
 
 def move(plant: str, x: float, v: float, u: float) -> tuple[float, float]:
-    """Position and velocity one row later."""
+    """Return position and velocity one row later."""
     if plant == "gain":
         return u, 0.0
     if plant == "integrator":
@@ -46,28 +45,29 @@ def move(plant: str, x: float, v: float, u: float) -> tuple[float, float]:
     return x + v, v
 
 
-def choose(
-    kind: str, t: int, old: np.ndarray, memory: np.ndarray, feedback: np.ndarray, random: Any
-) -> tuple[Any, Any]:
-    """The next command and its memory. policy: feedback from what is seen, and exploration that wanders."""
+def choose(kind: str, t: int, old: np.ndarray, drift: np.ndarray, feedback: np.ndarray, random: Any) -> tuple[Any, Any]:
+    """Return the next command and the next drift, the correlated noise of `smooth` and `policy`.
+
+    `policy` is feedback on the observation plus the drift.
+    """
     size = len(old)
     if kind == "white":
-        return random.uniform(-1, 1, size), memory
+        return random.uniform(-1, 1, size), drift
     if kind == "held":
-        return (random.uniform(-1, 1, size) if t % 10 == 0 else old), memory
+        return (random.uniform(-1, 1, size) if t % 10 == 0 else old), drift
     if kind == "smooth":
-        memory = 0.95 * memory + 0.3 * random.normal(size=size)
-        return np.clip(memory, -3, 3), memory
-    memory = 0.8 * memory + 0.3 * random.normal(size=size)
-    return np.tanh(feedback + memory), memory
+        drift = 0.95 * drift + 0.3 * random.normal(size=size)
+        return np.clip(drift, -3, 3), drift
+    drift = 0.8 * drift + 0.3 * random.normal(size=size)
+    return np.tanh(feedback + drift), drift
 
 
 def synthetic(plant: str, kind: str, noise: float, delay: int, random: Any) -> list[list[float]]:
-    """Rows of episode, time, command, observation; noise of the sensor relative to the signal's deviation."""
-    states, rows, x, v, u, memory, scale = [0.0], [], 0.0, 0.0, np.zeros(1), np.zeros(1), 0.0
+    """Return rows of episode, time, command, observation; sensor noise is relative to the signal's deviation."""
+    states, rows, x, v, u, drift, scale = [0.0], [], 0.0, 0.0, np.zeros(1), np.zeros(1), 0.0
     for t in range(ROWS):
         seen = states[max(0, t - delay)] + noise * scale * random.normal()
-        u, memory = choose(kind, t, u, memory, np.array([-0.5 * seen]), random)
+        u, drift = choose(kind, t, u, drift, np.array([-0.5 * seen]), random)
         rows.append([0, ROW * t, float(u[0]), seen])
         x, v = move(plant, x, v, float(u[0]))
         states.append(x)
@@ -77,14 +77,14 @@ def synthetic(plant: str, kind: str, noise: float, delay: int, random: Any) -> l
 
 
 def simulated(task: str, kind: str, noise: float, delay: int, random: Any) -> list[list[float]]:
-    """The same of a Gymnasium task under a Delayed."""
+    """Return the same rows for a Gymnasium task wrapped in `Delayed`."""
     env = make_task(task, delay)
     high = env.action_space.high
     gains = 0.1 * random.normal(size=(len(high), env.observation_space.shape[0]))
     obs, _ = env.reset(seed=int(random.integers(2**31)))
-    rows, u, memory, episode = [], np.zeros(len(high)), np.zeros(len(high)), 0
+    rows, u, drift, episode = [], np.zeros(len(high)), np.zeros(len(high)), 0
     for t in range(ROWS):
-        u, memory = choose(kind, t, u, memory, gains @ obs, random)
+        u, drift = choose(kind, t, u, drift, gains @ obs, random)
         u = np.clip(u, -1, 1)
         rows.append([episode, ROW * t, *u, *obs])
         obs, _, terminated, truncated, _ = env.step((u * high).astype(np.float32))
@@ -99,7 +99,7 @@ def simulated(task: str, kind: str, noise: float, delay: int, random: Any) -> li
 
 
 def write(path: Path, rows: list[list[float]], commands: int) -> None:
-    """As a log."""
+    """Write rows as a CSV log."""
     names = ["episode", "time", *(f"command_{i}" for i in range(commands))]
     names += [f"obs_{i}" for i in range(len(rows[0]) - len(names))]
     with path.open("w", newline="") as file:
@@ -107,7 +107,7 @@ def write(path: Path, rows: list[list[float]], commands: int) -> None:
 
 
 def levels(path: Path) -> float:
-    """What people try first: the lag at which a command and an observation themselves correlate most, in rows."""
+    """Return the lag, in rows, at which raw commands and observations correlate most: the naive estimate."""
     log = read_signals(path)
     u, y = (v - v.mean(0) for v in (log.commands, log.observations))
     u, y = u / u.std(0), y / np.maximum(y.std(0), 1e-12)
@@ -116,18 +116,18 @@ def levels(path: Path) -> float:
 
 
 def measure(path: Path, delay: int) -> dict[str, Any]:
-    """Estimates in rows of delay: a response one row later is a delay of 0."""
-    found: dict[str, Any] = {"delay": delay, "levels": levels(path)}
+    """Return all estimates in rows of delay; a response one row later is a delay of 0."""
+    row: dict[str, Any] = {"delay": delay, "levels": levels(path)}
     try:
         e = from_log(path, longest=(LONGEST - 1) * ROW)
     except DelayRLError as error:
-        return found | {"dead time": None, "increments": None, "error": str(error).split(": ", 1)[1][:60]}
-    found |= {"dead time": e.delay / ROW, "increments": e.peak.lag / ROW - 1, "strength": e.strength}
-    return found | {"low": e.low / ROW, "high": e.high / ROW}
+        return row | {"dead time": None, "increments": None, "error": str(error).split(": ", 1)[1][:60]}
+    row |= {"dead time": e.delay / ROW, "increments": e.peak.lag / ROW - 1, "strength": e.strength}
+    return row | {"low": e.low / ROW, "high": e.high / ROW}
 
 
 def cases() -> Iterator[tuple[dict[str, Any], Any]]:
-    """Every log: what it is, and how to make it."""
+    """Yield each log's description and the function that makes it."""
     for plant, kind, noise, seed in product(PLANTS, COMMANDS, NOISES, range(SEEDS)):
         yield {"plant": plant, "commands": kind, "noise": noise, "seed": seed}, synthetic
     for task, kind, noise, seed in product(TASKS, COMMANDS, (0.0, 0.03), range(SEEDS)):
@@ -135,7 +135,7 @@ def cases() -> Iterator[tuple[dict[str, Any], Any]]:
 
 
 def run() -> None:
-    """All rows."""
+    """Measure every log and write the rows."""
     lines = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
@@ -155,13 +155,13 @@ def run() -> None:
 
 
 def score(lines: list[dict[str, Any]], method: str) -> str:
-    """Share of logs whose delay is found to half a row; and whose error is one row at most."""
+    """Return the share of logs measured to within half a row, and in brackets to within one row."""
     errors = [abs(line[method] - line["delay"]) if line[method] is not None else np.inf for line in lines]
     return f"{np.mean(np.array(errors) < 0.5):.0%} ({np.mean(np.array(errors) < 1.5):.0%})"
 
 
 def table(groups: list[tuple[str, list[dict[str, Any]]]], head: str) -> str:
-    """Markdown: one group of logs a line."""
+    """Return a Markdown table with one group of logs per line."""
     text = [f"| {head} | logs | dead time | peak of increments | peak of levels | in the interval |"]
     text.append("| --- | --- | --- | --- | --- | --- |")
     for name, lines in groups:
@@ -172,7 +172,7 @@ def table(groups: list[tuple[str, list[dict[str, Any]]]], head: str) -> str:
 
 
 def tables() -> None:
-    """Into the page."""
+    """Write the tables into docs/measure.md."""
     lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
     own = [line for line in lines if line["plant"] in PLANTS]
     groups = [
@@ -185,18 +185,18 @@ def tables() -> None:
     ]
     unrelated = [line for line in lines if line["plant"] == "unrelated"]
     alarms = sum(line["dead time"] is not None for line in unrelated)
-    late = [c["dead time"] - c["delay"] for c in own if c["dead time"] is not None]
+    errors = [c["dead time"] - c["delay"] for c in own if c["dead time"] is not None]
     text = table([*groups, ("all", own)], "plant") + "\n\n"
     text += table([*tasks, ("all", [c for _, group in tasks for c in group])], "task, commands") + "\n\n"
-    found = [line for line in lines if line["plant"] != "unrelated" and line["dead time"] is not None]
-    wide = [line["high"] - line["low"] > WIDE for line in found]
-    wrong = [abs(line["dead time"] - line["delay"]) > 1.5 for line in found]
+    measured = [line for line in lines if line["plant"] != "unrelated" and line["dead time"] is not None]
+    wide = [line["high"] - line["low"] > WIDE for line in measured]
+    wrong = [abs(line["dead time"] - line["delay"]) > 1.5 for line in measured]
     text += (
         f"Of {len(unrelated)} logs of unrelated signals (half of them random walks) {alarms} showed a delay. On the "
-        f"plants the dead time was too short in {np.mean(np.array(late) < -0.5):.0%} and too long in "
-        f"{np.mean(np.array(late) > 0.5):.0%} of the logs. Of the {sum(wrong)} answers that "
+        f"plants the dead time was too short in {np.mean(np.array(errors) < -0.5):.0%} and too long in "
+        f"{np.mean(np.array(errors) > 0.5):.0%} of the logs. Of the {sum(wrong)} answers that "
         f"were off by two rows or more {sum(np.logical_and(wide, wrong))} came with an interval so wide "
-        f"that the command warns, of the {len(found) - sum(wrong)} others "
+        f"that the command warns, of the {len(measured) - sum(wrong)} others "
         f"{sum(np.logical_and(wide, np.logical_not(wrong)))}. "
         "Results: `benchmarks/results/measure.jsonl`."
     )
@@ -207,7 +207,7 @@ def tables() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tables", action="store_true", help="only write the tables again")
+    parser.add_argument("--tables", action="store_true", help="only rewrite the tables")
     if not parser.parse_args().tables:
         run()
     tables()

@@ -1,6 +1,6 @@
-"""What the wrappers cost: steps of HalfCheetah-v5 with and without them, alternating: `python benchmarks/overhead.py`.
+"""Measure what the wrappers cost, on alternating steps with and without them: `python benchmarks/overhead.py`.
 
-Writes benchmarks/results/overhead.jsonl, from which figures.py makes the table.
+The task is HalfCheetah-v5. Writes benchmarks/results/overhead.jsonl, from which figures.py makes the table.
 """
 
 import json
@@ -22,7 +22,7 @@ DELAYS = ("5", "50", "uniform:1:5@fifo")
 
 
 def seconds(env: Any, steps: int) -> float:
-    """Of processor time, for one step."""
+    """Measure the processor time of one step, in seconds."""
     env.reset(seed=0)
     actions = [env.action_space.sample() for _ in range(64)]
     began = time.process_time()
@@ -34,21 +34,21 @@ def seconds(env: Any, steps: int) -> float:
 
 
 def main() -> None:
-    """Measure, alternating."""
+    """Measure every wrapper against the bare task, in alternation, and write the ratios."""
     with quiet():
         cases: list[tuple[str, int, Any, Any]] = []
         bare = gym.make(TASK, disable_env_checker=True)
         for delay in DELAYS:
-            one = Delayed(gym.make(TASK, disable_env_checker=True), delay)
+            delayed = Delayed(gym.make(TASK, disable_env_checker=True), delay)
             cases += [
-                (f"Delayed {delay}", 1, bare, one),
-                (f"AugmentedObservation {delay}", 1, bare, AugmentedObservation(one)),
+                (f"Delayed {delay}", 1, bare, delayed),
+                (f"AugmentedObservation {delay}", 1, bare, AugmentedObservation(delayed)),
             ]
         for count in (4, 16):
             many = gym.make_vec(TASK, count, "sync")
-            late = DelayedVector(gym.make_vec(TASK, count, "sync"), "5")
-            cases += [("DelayedVector 5", count, many, late)]
-            cases += [("AugmentedVectorObservation 5", count, many, AugmentedVectorObservation(late))]
+            delayed_vector = DelayedVector(gym.make_vec(TASK, count, "sync"), "5")
+            cases += [("DelayedVector 5", count, many, delayed_vector)]
+            cases += [("AugmentedVectorObservation 5", count, many, AugmentedVectorObservation(delayed_vector))]
         ratios: dict[tuple[str, int], list[float]] = {case[:2]: [] for case in cases}
         for number in range(ROUNDS):
             for name, count, without, wrapped in cases:

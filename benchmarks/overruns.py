@@ -1,6 +1,6 @@
-"""Three answers to an age that was not trained, played with a run: `python benchmarks/overruns.py RUN OUT.jsonl`.
+"""Compare three answers to an untrained age on one run: `python benchmarks/overruns.py RUN OUT.jsonl`.
 
-`hold` and `clip` are the controller's; `last` is what a buffer of fixed length does: it forgets the oldest actions.
+`hold` and `clip` are the controller's. `last` is what a buffer of fixed length does: it drops the oldest actions.
 """
 
 import json
@@ -25,7 +25,7 @@ EPISODES = 10
 
 
 class Last:
-    """Shows a policy the newest Δ actions, however old the observation is."""
+    """A policy that is shown the newest Δ actions, however old the observation is."""
 
     def __init__(self, policy: ControlPolicy) -> None:
         self._policy = policy
@@ -33,7 +33,7 @@ class Last:
         self.low, self.high, self.max_age = policy.low, policy.high, 64
 
     def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
-        """Of the actions since, the newest."""
+        """Act on the observation and the newest of the actions since."""
         longest = self._policy.max_age
         if age <= longest:
             return self._policy(obs, actions[:longest], age)
@@ -41,7 +41,7 @@ class Last:
 
 
 def returns(env: gym.Env[Any, Any], policy: ControlPolicy, link: Link, on_overrun: str) -> list[float]:
-    """Of `EPISODES` episodes, each with its own start state and network."""
+    """Return the returns of `EPISODES` episodes, each with its own start state and random link."""
     controller = Controller(policy, on_overrun=on_overrun)
     totals = []
     for episode in range(EPISODES):
@@ -60,6 +60,7 @@ def returns(env: gym.Env[Any, Any], policy: ControlPolicy, link: Link, on_overru
 
 
 def main() -> None:
+    """Play every link with every answer and write the returns."""
     run, out = Path(sys.argv[1]), Path(sys.argv[2])
     config = json.loads((run / "config.json").read_text())
     policy = RunPolicy(run)

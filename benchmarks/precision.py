@@ -1,7 +1,8 @@
-"""What `--precision` costs in accuracy: `python benchmarks/precision.py` writes benchmarks/results/precision.jsonl.
+"""Measure what `--precision` costs in accuracy: `python benchmarks/precision.py`.
 
-Emulated on any device: what enters each layer's products, forward and backward, is rounded to the significant bits of
-the format, and the sums are of float32, as such products are defined on a GPU. VDPO, preset `paper`, HalfCheetah-v5.
+The script emulates the formats on any device. It rounds the factors of each layer's products, forward and backward, to
+the significant bits of the format and adds in float32, as a GPU does. VDPO, preset `paper`, HalfCheetah-v5.
+Writes benchmarks/results/precision.jsonl.
 """
 
 import json
@@ -27,7 +28,7 @@ SPEC, BATCH = Spec(17, 6, 5), 256
 
 
 def layer(bits: int) -> Any:
-    """`networks.linear` with products of rounded factors."""
+    """Return a `networks.linear` that rounds its factors to so many bits of mantissa."""
 
     def rounded(x: Array) -> Array:
         return jax.lax.reduce_precision(x, 8, bits)
@@ -36,8 +37,8 @@ def layer(bits: int) -> Any:
     def product(x: Array, w: Array) -> Array:
         return rounded(x) @ rounded(w)
 
-    def backward(given: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
-        x, w = given
+    def backward(factors: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
+        x, w = factors
         return rounded(g) @ rounded(w).T, rounded(x).T @ rounded(g)
 
     product.defvjp(lambda x, w: (product(x, w), (x, w)), backward)
@@ -50,26 +51,27 @@ def layer(bits: int) -> Any:
 
 
 def measure(bits: int, seed: int) -> tuple[Array, Array]:
-    """Actions of the delayed policy at every age, and the gradient of the belief's loss, of fresh networks."""
+    """Return the delayed policy's actions at every age and the gradient of the belief loss, of untrained networks."""
     networks.linear = transformer.linear = layer(bits)
     agent = AGENTS["vdpo"].presets["paper"].agent
-    init, draw, dropout = jax.random.split(jax.random.key(seed), 3)
-    state = agent.init(SPEC, init)
+    init_key, data_key, dropout_key = jax.random.split(jax.random.key(seed), 3)
+    state = agent.init(SPEC, init_key)
     shapes = {"obs": (BATCH, 17), "actions": (BATCH, 5, 6), "states": (BATCH, 5, 17)}
-    keys = jax.random.split(draw, 3)
+    keys = jax.random.split(data_key, 3)
     data = {n: jax.random.normal(k, shape) for (n, shape), k in zip(shapes.items(), keys, strict=True)}
     x = Unseen(data["obs"], jnp.tanh(data["actions"]), data["states"], jnp.ones((BATCH, 5), bool))
     mean = networks.mode(agent.policy(state, x.obs, x.actions))
-    gradient = jax.grad(lambda params: agent.belief_loss(params, x, dropout)[0])((state.encoder, state.decoder))
+    gradient = jax.grad(lambda params: agent.belief_loss(params, x, dropout_key)[0])((state.encoder, state.decoder))
     return mean, jnp.concatenate([g.ravel() for g in jax.tree.leaves(gradient)])
 
 
 def distance(x: Array, exact: Array) -> float:
+    """Return the length of the error relative to the length of `exact`."""
     return float(jnp.linalg.norm(x - exact) / jnp.linalg.norm(exact))
 
 
 def main() -> int:
-    """Five seeds, each format against float32."""
+    """Compare each format with float32 on five seeds."""
     lines, exact = [], [measure(23, seed) for seed in range(5)]
     for name, bits in MANTISSA.items():
         errors = [list(map(distance, measure(bits, seed), right)) for seed, right in enumerate(exact)]

@@ -1,7 +1,7 @@
-"""Every agent on small tasks, three seeds in lockstep: `python benchmarks/small.py TASK [AGENT …]`.
+"""Train every agent on a small task, three seeds in lockstep: `python benchmarks/small.py TASK [AGENT …]`.
 
-Runs land below runs/small/TASK (the same command resumes); then the rows of all that are complete there are collected
-into benchmarks/results/TASK.jsonl, with 20 episodes on start states that the run never saw.
+Runs are stored below runs/small/TASK; the same command resumes them. The rows of all complete runs there are then
+collected into benchmarks/results/TASK.jsonl, with 20 episodes on start states that the run never saw.
 """
 
 import argparse
@@ -32,7 +32,7 @@ OWN: dict[tuple[str, str], dict[str, Any]] = {
 
 
 def main() -> None:
-    """Train and collect."""
+    """Train the agents that the command line names, then collect all complete runs of the task."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("task", choices=list(TASKS))
     parser.add_argument("agents", nargs="*", default=list(AGENTS))

@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))  # the exact tools are shared with the tests
+sys.path.insert(0, str(ROOT / "tests" / "agents"))  # the exact solvers are shared with the tests
 
 import tabular as tab  # noqa: E402
 
@@ -47,7 +47,7 @@ def row(label: str, values: list[float], digits: int = 3) -> None:
 
 
 def delay_cost(axes: Any) -> None:
-    """J* against the delay, relative to no delay."""
+    """Plot J* against the delay, relative to no delay."""
     heading("J* for delays 0, 1, 2, 3")
     delays = range(4)
     for seed in range(5):
@@ -87,7 +87,7 @@ def delay_cost(axes: Any) -> None:
 
 
 def latching(axes: Any) -> None:
-    """Returns of imitation on the tracking chain, by who collected the data and by direction."""
+    """Plot the returns of imitation on the tracking chain, by who collected the data and by direction."""
     heading("Tracking, temperature 0.1, delays 0, 1, 2, 3")
     mdp, temperature, delays = tab.tracking(), 0.1, range(4)
 
@@ -101,7 +101,7 @@ def latching(axes: Any) -> None:
         ]
 
     best = [tab.optimal_return(tab.augment(mdp, delay).mdp) for delay in delays]
-    found = {
+    curves = {
         "reverse, own data": returns("delayed", False),
         "reverse, argmin data": returns("lower_q", False),
         "reverse, reference's data": returns("reference", False),
@@ -110,15 +110,15 @@ def latching(axes: Any) -> None:
         "forward, reference's data (Eq. 6)": returns("reference", True),
     }
     row("best delayed policy", best)
-    for label, values in found.items():
+    for label, values in curves.items():
         row(label, values)
     bpql = [tab.bpql_fixed_point(mdp, delay, temperature)[1] for delay in delays]
     row("BPQL", [tab.policy_return(tab.augment(mdp, d).mdp, p) for d, p in zip(delays, bpql, strict=True)])
     axes.plot(delays, best, color=GREY, lw=4, alpha=0.45, label="best delayed policy")
-    axes.plot(delays, found["reverse, own data"], color=BLUE, marker="o", ms=4, label="reverse KL, own data")
+    axes.plot(delays, curves["reverse, own data"], color=BLUE, marker="o", ms=4, label="reverse KL, own data")
     axes.plot(
         delays,
-        found["reverse, argmin data"],
+        curves["reverse, argmin data"],
         color=BLUE,
         marker="x",
         ms=8,
@@ -127,7 +127,7 @@ def latching(axes: Any) -> None:
     )
     axes.plot(
         delays,
-        found["forward, own data (Eq. 7)"],
+        curves["forward, own data (Eq. 7)"],
         color=ORANGE,
         marker="o",
         ms=4,
@@ -135,7 +135,7 @@ def latching(axes: Any) -> None:
     )
     axes.plot(
         delays,
-        found["reverse, reference's data"],
+        curves["reverse, reference's data"],
         color=BLUE,
         marker="v",
         ms=5,
@@ -144,7 +144,7 @@ def latching(axes: Any) -> None:
     )
     axes.plot(
         delays,
-        found["forward, reference's data (Eq. 6)"],
+        curves["forward, reference's data (Eq. 6)"],
         color=ORANGE,
         marker="v",
         ms=5,
@@ -168,24 +168,24 @@ def latching(axes: Any) -> None:
 
 def trajectory_numbers() -> None:
     heading("Proposition 3.3: seed 0, 3 states, 2 actions, 4 steps, delays 0, 1, 2, 3")
-    found, gaps = [], []
+    divergences, gaps = [], []
     for delay in range(4):
         rng = np.random.default_rng(0)
         mdp = tab.random_mdp(rng, states=3, actions=2)
         reference = rng.dirichlet(np.ones(2), size=3)
         delayed = tab.augment(mdp, delay)
         policy = rng.dirichlet(np.ones(2), size=len(delayed.histories))
-        found.append(tab.trajectory_kl(mdp, delay, reference, policy))
+        divergences.append(tab.trajectory_kl(mdp, delay, reference, policy))
         by_belief = tab.mixture(delayed.belief, reference)
         gaps.append(tab.trajectory_kl(mdp, delay, reference, by_belief))
-    row("KL of the trajectories", [one.trajectory for one in found], 4)
-    row("sum, (s_t, x_t) jointly from π", [one.joint for one in found], 4)
-    row("sum, s_t from the belief", [one.belief for one in found], 4)
-    row("sum, s_t and x_t apart", [one.independent for one in found], 4)
-    row("printed constant", [one.printed_constant for one in found], 4)
-    row("mass of the printed law", [one.printed_mass for one in found], 4)
-    row("KL of Eq. (7), the belief mixture", [one.trajectory for one in gaps], 4)
-    row("... above the least possible", [one.minimiser_excess for one in gaps], 4)
+    row("KL of the trajectories", [d.trajectory for d in divergences], 4)
+    row("sum, (s_t, x_t) jointly from π", [d.joint for d in divergences], 4)
+    row("sum, s_t from the belief", [d.belief for d in divergences], 4)
+    row("sum, s_t and x_t apart", [d.independent for d in divergences], 4)
+    row("printed constant", [d.printed_constant for d in divergences], 4)
+    row("mass of the printed law", [d.printed_mass for d in divergences], 4)
+    row("KL of Eq. (7), the belief mixture", [d.trajectory for d in gaps], 4)
+    row("... above the least possible", [d.minimiser_excess for d in gaps], 4)
 
     mdp = tab.tracking()
     _, reference = tab.soft_optimal(mdp, 0.1)
@@ -194,12 +194,12 @@ def trajectory_numbers() -> None:
     chain = np.einsum("ya,yaz->yz", reference[windows.state], windows.mdp.transition)
     law = windows.mdp.initial @ chain
     rate = float(law @ tab.kl(reference[windows.state], best[windows.augmented]))
-    found = []
+    divergences = []
     for delay in range(4):
         belief_mixture = tab.mixture(tab.augment(mdp, delay).belief, reference)
-        found.append(tab.trajectory_kl(mdp, delay, reference, belief_mixture, horizon=6))
-    row("tracking, 6 steps: KL of Eq. (7)", [one.trajectory for one in found], 4)
-    row("... above the least possible", [one.minimiser_excess for one in found], 4)
+        divergences.append(tab.trajectory_kl(mdp, delay, reference, belief_mixture, horizon=6))
+    row("tracking, 6 steps: KL of Eq. (7)", [d.trajectory for d in divergences], 4)
+    row("... above the least possible", [d.minimiser_excess for d in divergences], 4)
     print(f"tracking, Δ = 1: every step after the first adds {rate:.4f} to the KL of the best π_Δ")
 
 
@@ -312,13 +312,13 @@ def fixed_point_numbers() -> None:
 
 
 def improved(mdp: tab.MDP, delay: int, shorter: int, temperature: float) -> Array:
-    """AD-SAC's delayed policy when its auxiliary task, with a shorter delay, is solved."""
+    """Return AD-SAC's delayed policy when its auxiliary task, with a shorter delay, is solved."""
     q, _ = tab.soft_optimal(tab.augment(mdp, shorter).mdp, temperature)
     return tab.softmax(tab.shorter_histories(mdp, delay, shorter) @ q / temperature)
 
 
 def random_mdps(axes: Any, count: int = 50) -> None:
-    """Returns on random MDPs, from 0 for uniformly random actions to 1 for the best delayed policy."""
+    """Plot returns on random MDPs, from 0 for uniformly random actions to 1 for the best delayed policy."""
     heading(f"{count} random MDPs, delay 2, temperature 0.1: 0 = random actions, 1 = best delayed policy")
     temperature, delay = 0.1, 2
     scores: dict[str, list[float]] = {}

@@ -1,13 +1,13 @@
-"""Record the golden trajectories: the nine tasks as Gymnasium's own -v4 run on MuJoCo 2.3.7.
+"""Record the golden trajectories: Gymnasium's own -v4 of the nine tasks on MuJoCo 2.3.7.
 
-MuJoCo 2.3.7 needs Python 3.11 or older, so this runs in an environment of its own, without delayrl:
+MuJoCo 2.3.7 needs Python 3.11 or older, so the script runs in a separate environment without delayrl:
 
     python3.11 -m venv golden
     golden/bin/pip install mujoco==2.3.7 "gymnasium[mujoco]==1.4.0"
     golden/bin/python benchmarks/golden/record.py tests/data/golden-mujoco-2.3.7.npz
 
-Each episode is stored as `<task>/<k>/{seed,actions,observations,rewards,terminated}`: `seed` is what `reset`
-was given, `observations` [T + 1, ...] begin with the reset's, `actions` [T, ...] are float32 as an agent's.
+Each episode is stored as `<task>/<k>/{seed,actions,observations,rewards,terminated}`. `seed` is the seed of `reset`,
+`observations` [T + 1, ...] begin with that of `reset`, and `actions` [T, ...] are float32, as an agent's are.
 `tests/envs/test_paper.py` replays the actions.
 """
 
@@ -18,7 +18,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-# Seeds, and the step at which an episode is cut. Ant, Hopper, Humanoid and Walker2d also reach a natural end.
+# Seeds, and the step at which an episode is cut. Ant, Hopper, Humanoid and Walker2d also terminate by themselves.
 EPISODES = {
     "Ant": ((7, 3, 48), 100),
     "HalfCheetah": ((7, 8), 100),
@@ -34,7 +34,7 @@ SCRIPTED = {("Pusher", 8), ("Pusher", 9)}  # random actions never touch Pusher's
 
 
 def push(model: "mujoco.MjModel", data: "mujoco.MjData") -> np.ndarray:
-    """Torques [7] in N m that press the fingertip into the object: a spring between them, and a damper."""
+    """Return torques [7] in N m that press the fingertip into the object by a spring and a damper."""
     tip, target = data.body("tips_arm"), data.body("object").xpos
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, tip.xpos, tip.id)
@@ -44,6 +44,7 @@ def push(model: "mujoco.MjModel", data: "mujoco.MjData") -> np.ndarray:
 
 
 def episode(task: str, seed: int, steps: int) -> dict[str, np.ndarray]:
+    """Play one episode of at most `steps` steps and return its arrays."""
     env = gymnasium.make(f"{task}-v4")
     model, data = env.unwrapped.model, env.unwrapped.data
     low, high = env.action_space.low, env.action_space.high
@@ -65,9 +66,10 @@ def episode(task: str, seed: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def main(path: str) -> None:
-    warnings.simplefilter("ignore", DeprecationWarning)  # "-v4 is out of date": it is what is wanted
+    """Record all episodes into one compressed file."""
+    warnings.simplefilter("ignore", DeprecationWarning)  # "-v4 is out of date"
     if mujoco.__version__ != "2.3.7":
-        sys.exit(f"golden trajectories are MuJoCo 2.3.7's; this environment has {mujoco.__version__}")
+        sys.exit(f"golden trajectories need MuJoCo 2.3.7, got {mujoco.__version__}; install mujoco==2.3.7")
     arrays = {"versions": np.array([f"mujoco {mujoco.__version__}", f"gymnasium {gymnasium.__version__}"])}
     for task, (seeds, steps) in EPISODES.items():
         for k, seed in enumerate(seeds):

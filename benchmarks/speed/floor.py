@@ -1,7 +1,7 @@
-"""What an update costs at least, and where its time goes: `python floor.py SIDE` prints one JSON object.
+"""Time the parts of our training step and estimate its floor: `python floor.py SIDE` prints one JSON object.
 
-The floor of a training step is its matrix products' arithmetic at the best rate at which this machine multiplies
-matrices. Parts are timed one by one, each waited for; in training they overlap, so their sum may exceed a step.
+The floor is the arithmetic of the matrix products at the best rate at which this machine multiplies matrices. Each part
+is timed alone; in training the parts overlap, so their sum may exceed a step.
 """
 
 import json
@@ -31,13 +31,14 @@ from delayrl.training.buffers import keep_buffers
 from delayrl.training.train import on_device
 
 ROWS = 2_000
-"""Rows of the replay that the parts are timed on. They fit into the caches, unlike a full one; a batch is small."""
+"""Rows of the replay for timing the parts. They fit into the caches, unlike a full replay, but a batch is small."""
 
 
 def matmul_flops(function: Callable[..., Any], *args: Any) -> float:
-    """Multiplications and additions of all matrix products of a function on arguments of these shapes.
+    """Count the multiplications and additions of all matrix products of a function on arguments of these shapes.
 
-    Loops count as often as they run. Of a branch the mean counts: SAC's actor learns in every second update.
+    A loop counts as often as it runs. A branch counts as the mean of its cases: SAC's actor learns at every second
+    update.
     """
     return _products(jax.make_jaxpr(function)(*args).jaxpr)
 
@@ -70,12 +71,12 @@ def _jaxprs(value: Any) -> list[Any]:
 
 
 def amortised(phases: list[tuple[int, int, float]]) -> float:
-    """What one environment step costs: of phases (every so many steps, so many updates, the cost of one update)."""
+    """Return the cost per environment step of phases, each (every so many steps, updates, cost of one update)."""
     return sum(updates * cost / every for every, updates, cost in phases)
 
 
 def median_seconds(function: Callable[[], Any], seconds: float = 0.6, least: int = 5) -> float:
-    """Of one call, waited for."""
+    """Time a call until its result is ready and return the median, in seconds."""
     jax.block_until_ready(function())
     times: list[float] = []
     until = time.perf_counter() + seconds
@@ -87,7 +88,7 @@ def median_seconds(function: Callable[[], Any], seconds: float = 0.6, least: int
 
 
 def rate(left: tuple[int, int], right: tuple[int, int], transposed: str = "", seconds: float = 0.5) -> float:
-    """The best rate of a product, in operations a second: the best, because others may use the machine too."""
+    """Return the best rate of a product, in operations per second; the best, because others may use the machine."""
     a, b = jnp.ones(left), jnp.ones(right)
     products = {"": lambda a, b: a @ b, "left": lambda a, b: a.T @ b, "right": lambda a, b: a @ b.T}
     multiply = jax.jit(products[transposed])
@@ -102,11 +103,11 @@ def rate(left: tuple[int, int], right: tuple[int, int], transposed: str = "", se
 
 
 SQUARES = {"cpu": (512, 1024, 2048), "gpu": (2048, 4096, 8192)}
-"""Large enough for the device's best rate: of small ones a GPU has done before the next is called."""
+"""Sizes large enough for the device's best rate. A GPU finishes small ones before the next call arrives."""
 
 
 def rates(rows: int, width: int, device: str) -> dict[str, float]:
-    """Of squares; and forward, for the weights' gradient and for the inputs', in a square layer of an update."""
+    """Return rates of squares, and of a square layer's products: forward, weights' gradient, inputs' gradient."""
     x, w = (rows, width), (width, width)
     return {
         "square": max(rate((size, size), (size, size)) for size in SQUARES[device]),
@@ -117,7 +118,7 @@ def rates(rows: int, width: int, device: str) -> dict[str, float]:
 
 
 def filled(spec: Any, rows: int) -> ring.Replay:
-    """A replay with episodes of 1,000 random steps in it."""
+    """Return a replay filled with episodes of 1,000 random steps."""
     random = np.random.default_rng(0)
     number = np.arange(rows)
     moment = number % 1000
@@ -140,7 +141,7 @@ def filled(spec: Any, rows: int) -> ring.Replay:
 
 
 class Prepared(NamedTuple):
-    """One side's agent, as it is in training: with a state and a filled replay for each seed."""
+    """One side's agent as in training, with a state and a filled replay for each seed."""
 
     agent: Agent
     spec: Spec
@@ -151,11 +152,10 @@ class Prepared(NamedTuple):
 
 
 def prepare(side: dict[str, Any]) -> Prepared:
-    """What a side trains, without its loop."""
+    """Build what a side trains, without its loop."""
     agent = override(AGENTS[side["agent"]].presets[side["preset"]].agent, side["options"])
     delay: Delay = delay_of(side["env"], side["delay"])
     actor = Actor(make(side["env"], delay.observed(), rescale=True), 0, agent.privileged)
-    actor.reset()
     spec = spec_of(actor.env)
     keep_buffers(agent, spec, side["seeds"])  # as `train` does
     keys = jax.vmap(jax.random.key)(jnp.arange(side["seeds"]))
@@ -165,24 +165,29 @@ def prepare(side: dict[str, Any]) -> Prepared:
 
 
 def parts(side: dict[str, Any]) -> dict[str, Any]:
-    """Seconds of each part of a training step of all seeds, matmul operations of a seed's step, bytes of its replay."""
+    """Measure a side.
+
+    Returns:
+        `parts`: seconds of each part of a training step of all seeds. `flops`: operations of the products in one seed's
+        step. `rates`: operations per second. `replay_bytes`: of one seed. `obs_size` and `peak_bytes`.
+    """
     agent, spec, actor, state, replay, keys = prepare(side)
-    seeds, one = side["seeds"], jax.tree.map(lambda x: x[0], replay)
+    seeds, first_replay = side["seeds"], jax.tree.map(lambda x: x[0], replay)
     seen = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * seeds), actor.seen)
 
     act = jax.jit(jax.vmap(partial(agent.act, explore=True)))
-    found = {"act": median_seconds(lambda: np.asarray(act(state, seen, keys)))}
+    seconds = {"act": median_seconds(lambda: np.asarray(act(state, seen, keys)))}
     random = np.random.default_rng(0)
-    found["environment"] = seeds * median_seconds(
+    seconds["environment"] = seeds * median_seconds(
         lambda: actor.step(random.uniform(-1, 1, spec.action_size).astype(np.float32))
     )
     flops = matmul_flops(partial(agent.act, explore=True), *jax.tree.map(lambda x: x[0], (state, seen)), keys[0])
     costs = []
     for index, phase in enumerate(agent.phases()):
         reach = (phase.batch, spec.delay, agent.ahead(spec))
-        seconds = update_seconds(phase, reach, state, replay, keys)
-        found[f"phase {index}"] = amortised([(phase.every, phase.updates, seconds)])
-        batch = jax.eval_shape(partial(windows, reach), one, keys[0])
+        update_cost = update_seconds(phase, reach, state, replay, keys)
+        seconds[f"phase {index}"] = amortised([(phase.every, phase.updates, update_cost)])
+        batch = jax.eval_shape(partial(windows, reach), first_replay, keys[0])
         single = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state)
         cost = matmul_flops(phase.update, single, batch, keys[0], jax.ShapeDtypeStruct((), jnp.int32))
         costs.append((phase.every, phase.updates, cost))
@@ -190,7 +195,7 @@ def parts(side: dict[str, Any]) -> dict[str, Any]:
     rows = phase.batch * max(spec.delay, 1)
     capacity = side.get("capacity", 1_000_000)
     return {
-        "parts": found,
+        "parts": seconds,
         "flops": flops,
         "rates": rates(rows, getattr(agent, "width", 256), side["device"]),
         "obs_size": spec.obs_size,
@@ -200,22 +205,22 @@ def parts(side: dict[str, Any]) -> dict[str, Any]:
 
 
 def windows(reach: tuple[int, int, int], replay: ring.Replay, key: Any) -> Any:
-    """A batch of one seed."""
+    """Sample a batch of windows for one seed."""
     return ring.sample(replay, key, *reach, jnp.int32(0))
 
 
 def update(phase: Phase, reach: tuple[int, int, int], state: Any, replay: ring.Replay, keys: Any, i: Any) -> Any:
-    """The i-th update of all seeds, sampling included: their new states."""
+    """Make the i-th update of all seeds, sampling included, and return their new states."""
 
-    def one(state: Any, replay: ring.Replay, key: Any) -> Any:
-        draw, learn = jax.random.split(jax.random.fold_in(key, i))
-        return phase.update(state, windows(reach, replay, draw), learn, i)[0]
+    def update_seed(state: Any, replay: ring.Replay, key: Any) -> Any:
+        sample_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+        return phase.update(state, windows(reach, replay, sample_key), update_key, i)[0]
 
-    return jax.vmap(one)(state, replay, keys)
+    return jax.vmap(update_seed)(state, replay, keys)
 
 
 def update_seconds(phase: Phase, reach: tuple[int, int, int], state: Any, replay: ring.Replay, keys: Any) -> float:
-    """Of one update of all seeds, sampling included: the mean over both of SAC's turns, or over a short round."""
+    """Return the mean seconds of an update of all seeds, sampling included, over SAC's two turns or a short round."""
     count = 2 if phase.updates == 1 else 20
 
     @jax.jit
@@ -229,18 +234,18 @@ def update_seconds(phase: Phase, reach: tuple[int, int, int], state: Any, replay
 
 
 def replay_bytes(spec: Any, capacity: int) -> int:
-    """Of one seed's replay."""
+    """Return the bytes of one seed's replay."""
     shapes = jax.eval_shape(lambda: ring.init(spec, capacity))
     return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(shapes))
 
 
 def main() -> None:
+    """Measure the side and print its JSON object."""
     pin()
     side = json.loads(sys.argv[1])
-    precision = side["options"].get(
-        "precision", "float32"
-    )  # else the products of a GPU would be coarser than training's
-    if on_cpu := side["device"] == "cpu":  # chosen without looking for it, which `keep_buffers` is to come before
+    # training's precision: a GPU's default is coarser
+    precision = side["options"].get("precision", "float32")
+    if on_cpu := side["device"] == "cpu":  # set by name: `keep_buffers` must come before JAX looks for devices
         jax.config.update("jax_platforms", "cpu")
     with on_device(None if on_cpu else side["device"]), jax.default_matmul_precision(PRODUCTS[precision]):
         print(json.dumps(parts(side)))

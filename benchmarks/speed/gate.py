@@ -1,10 +1,10 @@
-"""Where every side is measured: an environment that counts its steps and stops its owner between two slices.
+"""Measure any training loop from inside its environment, which counts steps and pauses the loop between slices.
 
-The side's own training loop runs as it is, whoever wrote it. Whenever a slice is over, the environment's `step` waits
-until the device is idle, reports, and does not come back before the next slice is asked for. So from one report to the
-next lie exactly N whole training steps, and between slices the side uses no processor.
+The side's own training loop runs unchanged. At the end of a slice, the environment's `step` waits until the device is
+idle, reports, and returns only when the next slice is requested. So exactly N complete training steps lie between two
+reports, and the side uses no processor between slices.
 
-Runs in the peers' environments too: needs Gymnasium, and nothing of ours.
+This file also runs in the peers' environments: it needs Gymnasium and nothing of delayrl.
 """
 
 import json
@@ -22,20 +22,25 @@ PREFIX = "delayrl-speed/"
 
 
 def pin() -> None:
-    """Keep this process to as many cores as OpenMP is given: XLA takes the number of its threads from there."""
+    """Pin this process to as many cores as OpenMP is given, because XLA takes its number of threads from there."""
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[: int(os.environ["OMP_NUM_THREADS"])])
 
 
 class Stop(BaseException):
-    """Ends a side's training loop from inside its environment."""
+    """End a side's training loop from inside its environment."""
 
 
 class Gate:
-    """Answers requests, one JSON object a line: {"steps": N} runs a slice of N environment steps, end of file stops.
+    """Answer requests, one JSON object per line: {"steps": N} runs a slice of N environment steps, end of file stops.
 
-    The first line is written once `warmup` steps are done: whatever `hello` gives. A slice's report has `seconds`,
-    `processor` (seconds of all threads), `peak_bytes` (resident, ever), and seconds by part where the side times some.
+    Args:
+        requests: where requests are read from.
+        reports: where reports are written. A slice's report has `seconds`, `processor` (seconds of all threads),
+            `peak_bytes` (largest resident set so far), and `parts` (seconds by part) if the side times parts.
+        warmup: environment steps before the first report.
+        settle: waits until the device is idle.
+        hello: returns the first report.
     """
 
     def __init__(
@@ -51,14 +56,14 @@ class Gate:
         self.parts: dict[str, float] = defaultdict(float)
 
     def tick(self) -> None:
-        """Called as an environment step begins."""
+        """Count an environment step that begins; between slices, wait."""
         if self._left == 0:
             self._between()
         self._left -= 1
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Adds to the seconds of a part of the slice."""
+        """Add the time of the block to a part of the slice."""
         began = time.perf_counter()
         yield
         self._settle()
@@ -84,20 +89,20 @@ class Gate:
 
 
 class Gated(gym.Wrapper):
-    """A task whose steps the gate counts."""
+    """Let the gate count the steps of a task."""
 
     def __init__(self, env: gym.Env, gate: Gate):
         super().__init__(env)
         self._gate = gate
 
     def step(self, action: Any) -> Any:
-        """Wait for the next slice where one has ended; then step."""
+        """Step, after waiting for the next slice if the last one has ended."""
         self._gate.tick()
         return self.env.step(action)
 
 
 def register(gate: Gate, task: str, *, endless: bool = False) -> str:
-    """The id under which Gymnasium makes `task` with the gate; `endless` for loops that cannot take a time limit."""
+    """Register `task` with the gate and return its Gymnasium id; `endless` removes the time limit."""
 
     def entry(**options: Any) -> gym.Env:
         return Gated(gym.make(task, disable_env_checker=True, **options).unwrapped, gate)

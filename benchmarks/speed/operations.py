@@ -1,7 +1,7 @@
-"""Where an update's time goes, operation by operation: `python benchmarks/speed/operations.py [WORK ...]`.
+"""Profile one update, operation by operation: `python benchmarks/speed/operations.py [WORK ...]`.
 
-On one core, so that operations do not overlap and their times add up; XLA's profiler gives each operation's time, its
-program says what the operation is. Writes benchmarks/results/operations.jsonl.
+The update runs on one core, so that operations do not overlap and their times add up. XLA's profiler gives the time of
+each operation and the compiled program its kind. Writes benchmarks/results/operations.jsonl.
 """
 
 import json
@@ -25,7 +25,7 @@ from works import WORKS
 from delayrl.run.provenance import versions
 
 RESULTS = Path(__file__).parent.parent / "results" / "operations.jsonl"
-DEFAULT = ("vdpo-5", "vdpo-64", "sac-sbx")  # the largest first: what it asks of the memory holds for the process
+DEFAULT = ("vdpo-5", "vdpo-64", "sac-sbx")  # the largest first: its buffers stay resident for the whole process
 UPDATES = 30
 
 LINE = re.compile(r"^ +(?:ROOT )?%(\S+) = (\([^=]*?\)|\S+) ([\w-]+)\(([^)]*)\)(.*)$", re.M)
@@ -33,38 +33,38 @@ BODY = re.compile(r"^%(\S+) \([^\n]*\{\n(.*?)^\}", re.S | re.M)
 
 
 def kinds(program: str) -> dict[str, str]:
-    """Of each operation of a compiled program, by its name: what it is.
+    """Return the kind of each operation of a compiled program, by name.
 
-    A product for the weights' gradient whose input XLA transposes first counts as one forward; of 4,000 rows and more,
-    where layers are made as two products, all count as attention's.
+    Two kinds are miscounted. A product for the weights' gradient whose input XLA transposes first counts as forward.
+    With 4,000 rows or more, where layers are computed as two products, all products count as attention's.
     """
     bodies = dict(BODY.findall(program))
-    found = {}
+    kind_of = {}
     for name, shape, operation, _, rest in LINE.findall(program):
         inside = re.search(r"calls=%([^\s,]+)", rest)
         text = rest + (bodies.get(inside[1], "") if inside else "")
         if operation == "dot" or (operation == "fusion" and " dot(" in text):
             if "lhs_batch_dims" in text:
-                found[name] = "products of attention"
+                kind_of[name] = "products of attention"
             elif re.search(r"lhs_contracting_dims=\{0\}", text):
-                found[name] = "products for the weights' gradients"
+                kind_of[name] = "products for the weights' gradients"
             else:
-                found[name] = "products, forward and for the inputs' gradients"
+                kind_of[name] = "products, forward and for the inputs' gradients"
         elif operation in ("while", "conditional"):
-            continue  # what is inside counts
+            continue  # their bodies are counted
         elif shape.startswith(("u32", "(u32")):
-            found[name] = "random bits"
+            kind_of[name] = "random bits"
         elif operation in ("copy", "concatenate", "transpose", "gather", "slice", "dynamic-slice"):
-            found[name] = "copies and gathers"
+            kind_of[name] = "copies and gathers"
         elif "reduce(" in text:
-            found[name] = "sums"
+            kind_of[name] = "sums"
         elif operation in ("fusion", "call"):
-            found[name] = "elementwise"
-    return found
+            kind_of[name] = "elementwise"
+    return kind_of
 
 
 def times(prepared: Prepared, index: int) -> dict[str, Any]:
-    """Milliseconds of an update of phase `index` by kind of operation, and how often each is called."""
+    """Return the milliseconds and calls of an update of phase `index`, by kind of operation."""
     agent, spec, _, state, replay, keys = prepared
     phase = agent.phases()[index]
     reach = (phase.batch, spec.delay, agent.ahead(spec))
@@ -80,7 +80,7 @@ def times(prepared: Prepared, index: int) -> dict[str, Any]:
         return (time.perf_counter() - began) / UPDATES
 
     round_of_updates()
-    whole = min(round_of_updates() for _ in range(3))
+    seconds = min(round_of_updates() for _ in range(3))
     known, spent, calls = kinds(compiled.as_text()), defaultdict[str, float](float), defaultdict[str, float](float)
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
@@ -93,19 +93,19 @@ def times(prepared: Prepared, index: int) -> dict[str, Any]:
                         calls[kind] += 1 / UPDATES
     flops = matmul_flops(lambda *a: update(phase, reach, *a), state, replay, keys, jnp.int32(0))
     return {
-        "milliseconds": float(f"{1e3 * whole:.4g}"),
+        "milliseconds": float(f"{1e3 * seconds:.4g}"),
         "gflop": float(f"{flops / 1e9:.4g}"),
         "kinds": {k: [float(f"{spent[k]:.3g}"), round(calls[k], 1)] for k in sorted(spent, key=lambda k: -spent[k])},
     }
 
 
 def main() -> int:
-    """Profile both phases of the works named, and write their rows."""
+    """Profile every phase of the named works and write the rows."""
     os.environ["OMP_NUM_THREADS"] = "1"
     pin()
     names = sys.argv[1:] or DEFAULT
     if unknown := [name for name in names if name not in WORKS]:
-        print(f"no work {', '.join(unknown)}; there are {', '.join(WORKS)}", file=sys.stderr)
+        print(f"unknown work {', '.join(unknown)}; choose from {', '.join(WORKS)}", file=sys.stderr)
         return 2
     lines = []
     for name in names:
@@ -117,7 +117,10 @@ def main() -> int:
             row |= times(prepared, index) | {"date": time.strftime("%Y-%m-%d"), "versions": versions()}
             lines.append(json.dumps(row))
             total = math.fsum(ms for ms, _ in row["kinds"].values())
-            print(f"{name}, phase {index}: {row['milliseconds']:.2f} ms, of it seen {total:.2f}", file=sys.stderr)
+            print(
+                f"{name}, phase {index}: {row['milliseconds']:.2f} ms, of which {total:.2f} in known operations",
+                file=sys.stderr,
+            )
     RESULTS.write_text("\n".join(lines) + "\n")
     return 0
 

@@ -1,7 +1,7 @@
-"""Ours and the peers, alternating: `make bench`, or `python benchmarks/speed/run.py --help`.
+"""Measure delayrl and its peers in alternating slices: `make bench`, or `python benchmarks/speed/run.py --help`.
 
-Writes benchmarks/results/speed.jsonl, one line a work; a work that is measured again takes the place of its line.
-Tables and pictures are made of it by benchmarks/figures.py.
+Writes benchmarks/results/speed.jsonl, one line per work; a new measurement replaces the line of the same work.
+benchmarks/figures.py turns the lines into tables and pictures.
 """
 
 import argparse
@@ -22,18 +22,18 @@ from works import SIZES, WORKS, Work
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results" / "speed.jsonl"
 WAITING = {kind: ("", "passive") for kind in ("vdpo", "sb3", "cleanrl")}
-"""How OpenMP's threads may wait: as it does by default, spinning for a while, or asleep. On a free machine torch is
-faster with the one, on a busy machine with the other; it is measured with whichever is faster."""
+"""How OpenMP's threads wait: spinning for a while (the default) or asleep. Torch is usually faster with the first on a
+free machine and with the second on a busy one, so each peer is measured with the faster."""
 TIMEOUT = 900
-"""Seconds after which a side that says nothing is given up: the first line waits for its compilation."""
+"""Seconds without a line after which a side is given up. The first line waits for compilation."""
 
 
 class MeasurementError(Exception):
-    """A side that cannot be measured, in one line."""
+    """Raised in one line if a side cannot be measured."""
 
 
 class Side:
-    """A worker process; between its slices it waits."""
+    """A worker process that waits between its slices."""
 
     def __init__(self, python: str, side: dict[str, Any], threads: int, waiting: str = ""):
         self.name, self.side, self.waiting = side["kind"], side, waiting
@@ -52,15 +52,15 @@ class Side:
         self.hello = self._read()
 
     def slice(self, steps: int) -> dict[str, Any]:
-        """Train so many steps of every seed; the report."""
+        """Train this many steps of every seed and return the report."""
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has been killed: `_read` says so
+        with contextlib.suppress(BrokenPipeError):  # it has been killed: `_read` raises
             self._process.stdin.write(json.dumps({"steps": steps * self.side["seeds"]}) + "\n")
             self._process.stdin.flush()
         return self._read()
 
     def close(self) -> None:
-        """Stop it, politely first."""
+        """Stop the process; kill it if it is still running after 20 seconds."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -86,7 +86,7 @@ class Side:
 
 
 def start(python: str, side: dict[str, Any], threads: int, ways: tuple[str, ...], steps: int) -> Side:
-    """A side in the way of waiting in which it is fastest. Where one fails, none is left."""
+    """Start a side with each way of waiting and keep the fastest. If one fails, close all."""
     sides: list[Side] = []
     try:
         for way in ways:
@@ -99,7 +99,7 @@ def start(python: str, side: dict[str, Any], threads: int, ways: tuple[str, ...]
 
 
 def fastest(sides: list[Side], steps: int) -> Side:
-    """The one of these that is fastest, after three slices of each in turn; the others are closed."""
+    """Return the fastest of these sides after three slices of each in turn, and close the others."""
     if len(sides) > 1:
         seconds = [[side.slice(steps)["seconds"] for side in sides] for _ in range(3)]
         order = np.argsort(np.median(seconds, axis=0))
@@ -110,7 +110,7 @@ def fastest(sides: list[Side], steps: int) -> Side:
 
 
 def environment(threads: int, waiting: str = "") -> dict[str, str]:
-    """The same for every side: threads, and room for two on one GPU; and how torch's threads wait (`WAITING`)."""
+    """Return the environment of a side: threads, room for two sides on one GPU, how torch waits (`WAITING`)."""
     return (
         {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
         | ({"OMP_WAIT_POLICY": waiting} if waiting else {})
@@ -124,13 +124,13 @@ def environment(threads: int, waiting: str = "") -> dict[str, str]:
 
 
 def quartiles(values: list[float]) -> dict[str, float]:
-    """Median, and the quartiles around it."""
+    """Return the median and the quartiles around it."""
     low, middle, high = np.percentile(values, [25, 50, 75])
     return {"median": float(f"{middle:.4g}"), "low": float(f"{low:.4g}"), "high": float(f"{high:.4g}")}
 
 
 def summary(side: dict[str, Any], steps: int, slices: list[dict[str, Any]]) -> dict[str, Any]:
-    """One side of a row: seconds are of one environment step of one seed."""
+    """Summarise one side of a row, in seconds per environment step of one seed."""
     count = steps * side["seeds"]
     seconds = [s["seconds"] / count for s in slices]
     parts = {name for s in slices for name in s.get("parts", {})}
@@ -150,7 +150,7 @@ def summary(side: dict[str, Any], steps: int, slices: list[dict[str, Any]]) -> d
 
 
 def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
-    """Measure a work on all its sides that can be, slice by slice in turn; a row."""
+    """Measure a work on all available sides, slice by slice in turn. Return a row, or None if ours fails."""
     steps = args.steps or work.steps[args.device]
     sides = {role: complete(side, work, steps, args) for role, side in work.sides.items()}
     open_sides: dict[str, Side] = {}
@@ -160,7 +160,7 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
             if python is None:
                 if role == "ours":
                     raise MeasurementError(f"{work.name} is ours alone")
-                say(f"  {side['kind']} is left out: its environment is not given")
+                say(f"  {side['kind']} is left out: no environment given")
                 continue
             try:
                 ways = WAITING.get(side["kind"], ("",)) if args.device == "cpu" else ("",)
@@ -208,7 +208,7 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
 
 
 def ratios(ours: list[dict[str, Any]], peer: list[dict[str, Any]], our_seeds: int, peer_seeds: int) -> dict[str, Any]:
-    """Peer's time over ours, each slice against the one beside it; for one environment step of one seed."""
+    """Return the peer's time divided by ours, per pair of neighbouring slices and per step of one seed."""
     scale = our_seeds / peer_seeds
     return {
         name: quartiles([scale * p[key] / o[key] for o, p in zip(ours, peer, strict=True)])
@@ -217,7 +217,7 @@ def ratios(ours: list[dict[str, Any]], peer: list[dict[str, Any]], our_seeds: in
 
 
 def floor(side: dict[str, Any], args: argparse.Namespace) -> dict[str, Any] | None:
-    """The parts' times and the floor, by floor.py in a process of its own."""
+    """Run floor.py in its own process and return the times of the parts and the floor; None if it fails."""
     done = subprocess.run(
         [sys.executable, str(HERE / "floor.py"), json.dumps(side)],
         capture_output=True,
@@ -231,7 +231,7 @@ def floor(side: dict[str, Any], args: argparse.Namespace) -> dict[str, Any] | No
 
 
 def complete(side: dict[str, Any], work: Work, steps: int, args: argparse.Namespace) -> dict[str, Any]:
-    """A side with all that its worker must know. Cloning once a slice is one KL update a step, as scheduled."""
+    """Add all that the worker needs to a side. Cloning once per slice keeps the scheduled one KL update per step."""
     options = dict(side.get("options", {}))
     if side.get("agent") == "vdpo":
         options |= {"clone_every": steps, "clone_updates": steps}
@@ -250,7 +250,7 @@ def complete(side: dict[str, Any], work: Work, steps: int, args: argparse.Namesp
 
 
 def interpreter(kind: str, args: argparse.Namespace) -> str | None:
-    """The Python of a side's environment; None where the user gave none."""
+    """Return the Python of a side's environment; None if the user gave none."""
     if kind in ("ours", "dummy"):
         return sys.executable
     if kind == "sbx":
@@ -261,7 +261,7 @@ def interpreter(kind: str, args: argparse.Namespace) -> str | None:
 
 
 def write(row: dict[str, Any], path: Path) -> None:
-    """Put a row in the place of the one of the same work, device and threads."""
+    """Replace the row of the same work, device and threads."""
     lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     kept = [line for line in lines if any(line[name] != row[name] for name in ("work", "device", "threads"))]
     order = [*WORKS, *SIZES]
@@ -271,11 +271,12 @@ def write(row: dict[str, Any], path: Path) -> None:
 
 
 def say(words: str) -> None:
+    """Print to stderr at once."""
     print(words, file=sys.stderr, flush=True)
 
 
 def report(row: dict[str, Any]) -> str:
-    """One line of what was found."""
+    """Summarise a row in one line."""
     ours = row["ours"]
     words = f"  ours {1e3 * ours['seconds']['median']:.2f} ms ({ours['steps_per_second']:.0f} steps/s)"
     if "peer" in row:
@@ -287,6 +288,7 @@ def report(row: dict[str, Any]) -> str:
 
 
 def pair(text: str) -> tuple[str, Any]:
+    """Split NAME=VALUE; the value is JSON if it parses as JSON, otherwise text."""
     name, _, value = text.partition("=")
     try:
         return name, json.loads(value)
@@ -295,22 +297,23 @@ def pair(text: str) -> tuple[str, Any]:
 
 
 def arguments() -> argparse.Namespace:
+    """Parse the command line; the default effort depends on what is measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("works", nargs="*", help="names of works; without any, those of the device (--list shows all)")
-    parser.add_argument("--list", action="store_true", help="show the works and stop")
-    parser.add_argument("--sizes", action="store_true", help="measure cost against size instead: ours alone")
+    parser.add_argument("works", nargs="*", help="names of works (--list); default: all of the device")
+    parser.add_argument("--list", action="store_true", help="list the works and exit")
+    parser.add_argument("--sizes", action="store_true", help="measure cost against size instead, ours alone")
     parser.add_argument("--device", choices=("cpu", "gpu"), default="cpu")
     parser.add_argument("--vdpo", metavar="PATH", help="a checkout of VDPO's released code")
     parser.add_argument("--cleanrl", metavar="PATH", help="a checkout of CleanRL")
     parser.add_argument("--torch-python", metavar="PYTHON", help="Python with torch: Stable-Baselines3, CleanRL, VDPO")
     parser.add_argument("--jax-python", metavar="PYTHON", help="Python with SBX")
     parser.add_argument("--threads", type=int, default=min(os.cpu_count() or 1, 16), help="cores for each side")
-    parser.add_argument("--rounds", type=int, help="at least so many slices of each side (9; 5 on a GPU, 3 of --sizes)")
-    parser.add_argument("--most", type=int, default=41, help="at most so many")
-    parser.add_argument("--seconds", type=float, help="go on beyond --rounds until so long (30; 3 of --sizes)")
-    parser.add_argument("--steps", type=int, help="environment steps of a slice, for trying out")
-    parser.add_argument("--set", type=pair, action="append", default=[], metavar="NAME=VALUE", help="an option of ours")
-    parser.add_argument("--no-floor", action="store_true", help="without parts and floor")
+    parser.add_argument("--rounds", type=int, help="at least this many slices per side (9; 5 on a GPU, 3 with --sizes)")
+    parser.add_argument("--most", type=int, default=41, help="at most this many slices per side")
+    parser.add_argument("--seconds", type=float, help="continue beyond --rounds for this long (30; 3 with --sizes)")
+    parser.add_argument("--steps", type=int, help="environment steps of a slice")
+    parser.add_argument("--set", type=pair, action="append", default=[], metavar="NAME=VALUE", help="set our option")
+    parser.add_argument("--no-floor", action="store_true", help="skip parts and floor")
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     if args.rounds is None:
@@ -321,7 +324,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Measure what was asked for; each row is written as soon as it is there."""
+    """Measure the requested works and write each row as soon as it is complete."""
     args = arguments()
     known = WORKS | SIZES
     if args.list:
@@ -329,25 +332,25 @@ def main() -> int:
             print(f"{work.name:24s} {work.title}")
         return 0
     if unknown := [name for name in args.works if name not in known]:
-        say(f"no work {', '.join(unknown)}; there are {', '.join(known)}")
+        say(f"unknown work {', '.join(unknown)}; choose from {', '.join(known)}")
         return 2
     for name, path in (("--vdpo", args.vdpo), ("--cleanrl", args.cleanrl)):
         if path and not Path(path).is_dir():
-            say(f"{name}: {path} is no folder; give a checkout")
+            say(f"{name}: {path} is not a folder; give the path of a checkout")
             return 2
     for name, python in (("--torch-python", args.torch_python), ("--jax-python", args.jax_python)):
         if python and not shutil.which(python):
-            say(f"{name}: {python} is no Python that can be started")
+            say(f"{name}: {python} cannot be started; give the path of a Python")
             return 2
     if not args.out.parent.is_dir():
-        say(f"--out: there is no folder {args.out.parent}")
+        say(f"--out: no folder {args.out.parent}; create it first")
         return 2
     if args.set and args.out == RESULTS:
-        say("--set measures another work than the table says: give --out, a file of its own")
+        say("--set changes the works that the table describes; give --out FILE")
         return 2
     chosen = args.works or [w.name for w in (SIZES if args.sizes else WORKS).values() if args.device in w.steps]
     if not chosen:
-        say(f"there are no such works of {args.device}; name some, and give --steps")
+        say(f"no such works are defined for {args.device}; name works and give --steps")
         return 2
     if elsewhere := [name for name in chosen if not args.steps and args.device not in known[name].steps]:
         say(f"{', '.join(elsewhere)} has no slice length for {args.device}; give --steps")

@@ -1,7 +1,7 @@
-"""One side of a comparison, as a process: `python worker.py SIDE`, with SIDE a JSON object; talks as gate.py says.
+"""Run one side of a comparison as a process: `python worker.py SIDE`, where SIDE is a JSON object.
 
-Each function below starts one side's own training loop on the gated task and comes back only by `Stop`. Runs in the
-environment of the side that it measures: imports only what that side needs.
+The process answers requests as gate.py describes. Each function below starts one side's own training loop on the gated
+task and only ends by `Stop`. The script runs in the environment of its side and imports only what that side needs.
 """
 
 import json
@@ -18,12 +18,12 @@ from typing import Any
 from gate import Gate, Stop, pin, register
 
 CAPACITY = 1_000_000
-"""Rows of everybody's replay: what the papers train with."""
+"""Rows of the replay on every side, as in the papers."""
 NEVER = 10**9
 
 
 def ours(side: dict[str, Any], gate: Gate) -> None:
-    """`delayrl.train`, all seeds in lockstep."""
+    """Run `delayrl.train` with all seeds in lockstep."""
     from delayrl import train
 
     env = register(gate, side["env"])
@@ -46,7 +46,7 @@ def ours(side: dict[str, Any], gate: Gate) -> None:
 
 
 def vdpo(side: dict[str, Any], gate: Gate) -> None:
-    """The released trainer, unchanged: it reads the global `config` of its module, and logs as it always does."""
+    """Run the released trainer, unchanged. It reads the global `config` of its module and logs as usual."""
     sys.path.insert(0, side["path"])
     import torch
     import VDPO as released  # noqa: N811
@@ -69,7 +69,7 @@ def vdpo(side: dict[str, Any], gate: Gate) -> None:
 
 
 def sb3(side: dict[str, Any], gate: Gate) -> None:
-    """Stable-Baselines3's SAC with its defaults: 256 × 256, batch 256, one update a step."""
+    """Run Stable-Baselines3's SAC with its defaults: 256 × 256, batch 256, one update per step."""
     from stable_baselines3 import SAC
 
     env = register(gate, side["env"])
@@ -84,12 +84,12 @@ def sb3(side: dict[str, Any], gate: Gate) -> None:
 
 
 def sbx(side: dict[str, Any], gate: Gate) -> None:
-    """SBX's SAC with its defaults: 256 × 256, batch 256, one update a step."""
+    """Run SBX's SAC with its defaults: 256 × 256, batch 256, one update per step."""
     import jax
     from sbx import SAC
 
     env = register(gate, side["env"])
-    with jax.default_device(jax.devices(side["device"])[0]):  # it has no option for that
+    with jax.default_device(jax.devices(side["device"])[0]):  # SBX has no option for the device
         SAC(
             "MlpPolicy",
             env,
@@ -100,7 +100,7 @@ def sbx(side: dict[str, Any], gate: Gate) -> None:
 
 
 def cleanrl(side: dict[str, Any], gate: Gate) -> None:
-    """CleanRL's script, run as a script. Under Gymnasium 1 it fails at a time limit, so its task has none."""
+    """Run CleanRL's script. It fails at a time limit under Gymnasium 1, so its task has none."""
     sys.path.insert(0, side["path"])
     env = register(gate, side["env"], endless=True)
     words = {
@@ -116,7 +116,7 @@ def cleanrl(side: dict[str, Any], gate: Gate) -> None:
 
 
 def dummy(side: dict[str, Any], gate: Gate) -> None:
-    """No learning at all: what the harness itself costs, and what tests it."""
+    """Step without learning, to test the harness and measure its own cost."""
     import gymnasium as gym
 
     env = gym.make(register(gate, side["env"]))
@@ -134,12 +134,12 @@ PACKAGES = ("delayrl", "torch", "jax", "jaxlib", "stable_baselines3", "sbx_rl", 
 
 
 def random_steps(side: dict[str, Any]) -> int:
-    """Steps without learning: enough that everyone's replay has whole batches of different rows."""
+    """Return the steps before learning: enough for every side's replay to fill batches with different rows."""
     return 300 if side["delay"] < 50 else 500
 
 
 def timed(owner: Any, name: str, gate: Gate) -> None:
-    """Have the calls of a method timed as a part of the slice."""
+    """Time the calls of a method as a part of the slice."""
     method = getattr(owner, name)
 
     def wrapped(*args: Any) -> Any:
@@ -150,7 +150,7 @@ def timed(owner: Any, name: str, gate: Gate) -> None:
 
 
 def settle() -> None:
-    """Wait until the device has nothing left to do."""
+    """Wait until the device is idle."""
     if jax := sys.modules.get("jax"):
         jax.block_until_ready(jax.live_arrays())
     if (torch := sys.modules.get("torch")) and torch.cuda.is_available():
@@ -158,14 +158,14 @@ def settle() -> None:
 
 
 def hello() -> dict[str, Any]:
-    """Versions of what is measured."""
-    found = {}
+    """Return the versions of the installed packages, and of delayrl on our side."""
+    packages = {}
     for package in PACKAGES:
         try:
-            found[package] = version(package)
+            packages[package] = version(package)
         except PackageNotFoundError:
             continue
-    report: dict[str, Any] = {"packages": found}
+    report: dict[str, Any] = {"packages": packages}
     if "delayrl" in sys.modules:
         from delayrl.run.provenance import versions
 
@@ -174,7 +174,7 @@ def hello() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Start the side; its prints go to stderr, the reports alone to stdout."""
+    """Start the side. Its prints go to stderr; only reports go to stdout."""
     pin()
     side = json.loads(sys.argv[1])
     reports = os.fdopen(os.dup(1), "w")

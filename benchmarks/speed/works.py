@@ -1,4 +1,4 @@
-"""What is measured: the same work on two sides, and our cost against size."""
+"""Define the benchmarks: the same work on two sides, and our cost against size."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,10 +6,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Work:
-    """A name, words for the table, environment steps of a slice on each device, and the sides: ours and a peer.
+    """One benchmark.
 
-    A side is a JSON object: `kind` (a function of worker.py), `env`, `delay`, `seeds`, `options`; ours also `agent`
-    and `preset`.
+    Attributes:
+        name: how the command line names it.
+        title: how the table names it.
+        steps: environment steps of a slice, by device.
+        sides: JSON objects for `ours` and `peer`, with `kind` (a function of worker.py), `env`, `delay`, `seeds` and
+            `options`; ours also has `agent` and `preset`.
     """
 
     name: str
@@ -19,11 +23,13 @@ class Work:
 
 
 def ours(agent: str, preset: str = "paper", delay: int = 0, seeds: int = 1, env: str = "", **options: Any) -> Any:
+    """Return a side that runs delayrl; `options` are hyperparameters."""
     fixed = {"kind": "ours", "agent": agent, "preset": preset, "delay": delay, "seeds": seeds}
     return fixed | {"env": env or CHEETAH, "options": options}
 
 
 def peer(kind: str, delay: int = 0, **options: Any) -> dict[str, Any]:
+    """Return a side that runs a peer; `options` are in the peer's words."""
     return {"kind": kind, "env": CHEETAH, "delay": delay, "options": options}
 
 

@@ -80,9 +80,9 @@ def test_operations_are_what_they_are() -> None:
 
     x, y, w, pairs = jnp.ones((320, 64)), jnp.ones((320, 32)), jnp.ones((64, 48)), jnp.ones((32, 5, 64))
     text = jax.jit(program).lower(x, y, w, pairs, jax.random.key(0)).compile().as_text()
-    found = operations.kinds(text).values()
-    assert {"products, forward and for the inputs' gradients", "products of attention"} <= set(found)
-    assert {"products for the weights' gradients", "random bits", "sums", "elementwise"} <= set(found)
+    kinds = operations.kinds(text).values()
+    assert {"products, forward and for the inputs' gradients", "products of attention"} <= set(kinds)
+    assert {"products for the weights' gradients", "random bits", "sums", "elementwise"} <= set(kinds)
 
 
 def test_amortised() -> None:
@@ -114,9 +114,9 @@ def test_ratios_pair_slices() -> None:
     """Each slice with the one beside it; of one environment step of one seed."""
     ours = [{"seconds": s, "processor": s / 2} for s in (1.0, 2.0, 4.0)]
     peer = [{"seconds": s, "processor": s} for s in (3.0, 4.0, 4.0)]
-    found = run.ratios(ours, peer, 1, 1)
-    assert found["ratio"]["median"] == 2
-    assert found["processor_ratio"]["median"] == 4
+    ratios = run.ratios(ours, peer, 1, 1)
+    assert ratios["ratio"]["median"] == 2
+    assert ratios["processor_ratio"]["median"] == 4
     assert run.ratios(ours, peer, 4, 1)["ratio"]["median"] == 8
     assert run.quartiles([4, 1, 3, 2, 5]) == {"median": 3, "low": 2, "high": 4}
 
@@ -223,7 +223,7 @@ def test_a_row_takes_the_place_of_its_older_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("words", "said"),
-    [(["--torch-python", "nowhere/python"], "is no Python"), (["--out", "nowhere/rows"], "no folder")],
+    [(["--torch-python", "nowhere/python"], "cannot be started"), (["--out", "nowhere/rows"], "no folder")],
 )
 def test_what_is_not_there_is_said_before_anything_is_measured(words, said, monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["run.py", "sac-sb3", *words])
@@ -243,7 +243,7 @@ def test_other_hyperparameters_are_not_published(monkeypatch, capsys) -> None:
 def test_no_works_is_no_success(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["run.py", "--sizes", "--device", "gpu"])
     assert run.main() == 2
-    assert "no such works of gpu" in capsys.readouterr().err
+    assert "no such works are defined for gpu" in capsys.readouterr().err
 
 
 def test_sbx_is_on_the_device_that_is_asked_for(monkeypatch) -> None:
@@ -280,7 +280,7 @@ def test_both_sides_clone_once_a_slice() -> None:
 
 def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     """Every row shows, what was not run is empty, and where the peer is faster it is said."""
-    rows = tables.rows()
+    rows = tables.read_rows()
     assert rows
     works = [row for row in rows if not row["work"].startswith("size-")]
     assert tables.compared(rows).count("\n") == len(works) + 1
