@@ -14,8 +14,9 @@ from delayrl.core.types import Spec
 from delayrl.deploy.export import bundle_files
 from delayrl.deploy.files import write_files
 from delayrl.play.policy import Policy
+from delayrl.run.arrays import flatten_tree
 from delayrl.run.configuration import values_of
-from delayrl.run.folder import Run, flatten_tree
+from delayrl.run.folder import Run
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
@@ -56,7 +57,7 @@ def run_of(path: Path, name: str = "vdpo", env: str = "Reacher-v5", delay: int =
     described |= {"privileged": agent.privileged, "hyperparameters": values_of(agent), "schedule": {}}
     run.create(described | {"seed": 3, "versions": {"numpy": "2"}})
     rows = [
-        {"step": step, "policy": policy, "episode": i, "return": float(step + i)}
+        {"step": step, "policy": policy, "episode": i, "reset_seed": i, "return": float(step + i), "length": 50}
         for step in (120, 240)
         for policy in ("agent", "reference")
         for i in range(2)

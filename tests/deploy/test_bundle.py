@@ -86,9 +86,9 @@ def test_calls_that_cannot_be_answered(original: Path, obs: Any, actions: Any, a
 
 
 def test_no_bundle(tmp_path: Path, original: Path) -> None:
-    refused(tmp_path / "nowhere", "no folder")
+    refused(tmp_path / "nowhere", "not a folder")
     refused(tmp_path, "it has no bundle.json")
-    refused(original / WEIGHTS, "no folder")
+    refused(original / WEIGHTS, "not a folder")
     with pytest.raises(DelayRLError, match="unknown backend 'torch'; there are numpy, onnx, jax"):
         load_bundle(original, "torch")
 
@@ -96,14 +96,14 @@ def test_no_bundle(tmp_path: Path, original: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "no JSON"),
-        (b"{", "no JSON"),
-        (b"[" * 100_000, "no JSON"),
-        (b'{"a":' * 100_000, "no JSON"),
-        (b"\x80\x04\x95", "no JSON"),
-        (b'{"format": NaN}', "no JSON"),
-        (b'{"format": 1, "format": 1}', "no JSON"),
-        (b'{"format": ' + b"9" * 5000 + b"}", "no JSON"),
+        (b"", "not JSON"),
+        (b"{", "not JSON"),
+        (b"[" * 100_000, "not JSON"),
+        (b'{"a":' * 100_000, "not JSON"),
+        (b"\x80\x04\x95", "not JSON"),
+        (b'{"format": NaN}', "not JSON"),
+        (b'{"format": 1, "format": 1}', "not JSON"),
+        (b'{"format": ' + b"9" * 5000 + b"}", "not JSON"),
         (b"[]", "no format"),
         (b"{}", "no format"),
         (b'{"format": 2}', "format 2; this version reads 1"),
@@ -230,20 +230,20 @@ def test_broken_weights(bundle: Path) -> None:
 
     huge = [2**31, 2**31]
     for data, words in [
-        (b"", "no safetensors"),
-        (whole[:7], "no safetensors"),
-        (whole[:100], "no safetensors"),
-        (whole[:-1], "no safetensors"),
-        (whole + b"\0", "no safetensors"),
+        (b"", "not a safetensors"),
+        (whole[:7], "not a safetensors"),
+        (whole[:100], "not a safetensors"),
+        (whole[:-1], "not a safetensors"),
+        (whole + b"\0", "not a safetensors"),
         (struct.pack("<Q", 2**63) + whole[8:], "header is too long"),
         (struct.pack("<Q", (1 << 20) + 1) + b" " * (1 << 21), "header is too long"),
         (with_header({}, b""), "lack array"),
-        (changed(shape=huge), "no safetensors"),
-        (changed(shape=huge, data_offsets=[0, 2**64 - 1]), "no safetensors"),
-        (changed(shape=[-1, 2]), "no safetensors"),
-        (changed(data_offsets=[0, 4]), "no safetensors"),
+        (changed(shape=huge), "not a safetensors"),
+        (changed(shape=huge, data_offsets=[0, 2**64 - 1]), "not a safetensors"),
+        (changed(shape=[-1, 2]), "not a safetensors"),
+        (changed(data_offsets=[0, 4]), "not a safetensors"),
         (changed(dtype="I32"), "expected float32"),
-        (changed(dtype="PICKLE"), "no safetensors"),
+        (changed(dtype="PICKLE"), "not a safetensors"),
         (changed(shape=[1, *entries[name]["shape"]]), "expected float32"),
     ]:
         forge(bundle, weights=data)
@@ -396,5 +396,5 @@ def test_the_command_line_says_it_in_one_line(bundle: Path, tmp_path: Path, caps
             main(command)
         out, err = capsys.readouterr()
         assert (end.value.code, out, err.count("\n")) == (2, "", 1)
-        assert "no safetensors file" in err
+        assert "not a safetensors file" in err
     assert not (tmp_path / "executed").exists()

@@ -120,12 +120,13 @@ def test_the_delay_of_actions_comes_along(tmp_path: Path) -> None:
     assert load_bundle(older).action_delay == 0
 
 
+ROW = b'{"step": 120, "policy": "agent", "episode": 0, "reset_seed": 1, "return": 2.0, "length": 3}'
+
+
 @pytest.mark.parametrize(
     "rows",
-    [b'{"step": 1}', b"3", b"\xff\xfe", b"[" * 100_000, b'{"policy": "agent", "step": -Infinity, "return": 1}']
-    + [
-        b'{"policy": "agent", "step": 120, "return": ' + value + b"}" for value in (b'"a"', b"null", b"9" * 400, b"NaN")
-    ],
+    [b'{"step": 1}', b"3", b"\xff\xfe", b"[" * 100_000, ROW.replace(b"120", b"-Infinity")]
+    + [ROW.replace(b"2.0", value) for value in (b'"a"', b"null", b"9" * 400, b"NaN")],
 )
 def test_odd_rows_are_one_line(rows: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = run_of(tmp_path / "run", "bpql")
@@ -162,7 +163,7 @@ def test_nothing_else_is_overwritten(run: Path, tmp_path: Path, capsys: pytest.C
     arguments = ["export", str(run), "--out"]
     assert "is not empty" in refused(capsys, *arguments, str(full))
     assert "holds no bundle" in refused(capsys, *arguments, str(full), "--force")
-    assert "no folder" in refused(capsys, *arguments, str(file), "--force")
+    assert "not a folder" in refused(capsys, *arguments, str(file), "--force")
     assert "not a run folder" in refused(capsys, "export", str(full), "--out", str(tmp_path / "new"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "full"]
     assert (full / "policy.onnx").read_text() == file.read_text() == "mine"

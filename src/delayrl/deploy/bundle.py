@@ -1,4 +1,4 @@
-"""A bundle, ready to act: `load_bundle` reads and checks its files, `Bundle` is the policy."""
+"""The policy of a bundle: `load_bundle` reads and checks the files, `Bundle` acts."""
 
 import operator
 from pathlib import Path
@@ -17,17 +17,17 @@ BACKENDS = ("numpy", "onnx", "jax")
 
 
 class Bundle:
-    """A policy, ready to act.
+    """A policy that was loaded from a bundle.
 
     Attributes:
         network: sizes, range of the actions, and architecture.
         obs_size, action_size: S and A.
-        low, high: the range of the actions, [A], in the task's own units.
-        min_age, max_age: the ages that it was trained for; max_age is Δ.
-        dt: seconds between two decisions, where the task says so, else None.
-        action_delay: the longest delay of actions in training, in steps, which is part of the age; 0 where unknown.
-        metadata: all of bundle.json.
-        backend: what computes: "numpy", "onnx" or "jax".
+        low, high: the range of the actions, [A], in the task's units.
+        min_age, max_age: the ages that it was trained for, in steps; max_age is Δ.
+        dt: seconds between two decisions; None if the task does not say.
+        action_delay: the longest delay of actions in training, in steps, which is part of the age; 0 if unknown.
+        metadata: the content of bundle.json.
+        backend: "numpy", "onnx" or "jax".
     """
 
     def __init__(self, network: Network, metadata: dict[str, Any], act: Act, backend: str) -> None:
@@ -41,26 +41,26 @@ class Bundle:
         self.action_delay = lag if type(lag) is int and 0 <= lag <= network.max_age else 0
 
     def __call__(self, obs: ArrayLike, actions: ArrayLike, age: int) -> NDArray[np.float32]:
-        """The deterministic action, in the task's own units. Nothing is remembered between calls.
+        """Compute the deterministic action. Calls do not depend on each other.
 
         Args:
             obs: the newest observation that has arrived, [S].
-            actions: the actions applied since it was made, oldest first, [Δ, A], in the task's own units; what stands
-                after the first `age` is not read.
-            age: how many those are, 0..Δ.
+            actions: the actions applied since it was made, oldest first, [Δ, A], in the task's units. Entries after the
+                first `age` are ignored.
+            age: how many actions those are, 0..Δ.
 
         Returns:
-            [A], float32.
+            [A], float32, in the task's units.
 
         Raises:
-            DelayRLError: wrong sizes, an age that was not trained, or numbers that are not finite.
+            DelayRLError: wrong sizes, an age beyond those of training, or numbers that are not finite.
         """
         try:
             age = operator.index(age)
         except TypeError:
             raise DelayRLError(f"an age counts whole steps; got {age!r}") from None
         try:
-            with np.errstate(over="ignore"):  # to infinity, which is refused below
+            with np.errstate(over="ignore"):  # overflow gives infinity, which is refused below
                 obs, actions = np.asarray(obs, np.float32), np.asarray(actions, np.float32)
         except (TypeError, ValueError, OverflowError):
             raise DelayRLError("the policy takes arrays of numbers: obs [S] and actions [Δ, A]") from None
@@ -81,14 +81,14 @@ class Bundle:
 
 
 def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
-    """Read a bundle, and check everything in it.
+    """Read a bundle, check everything in it, and return its policy.
 
     Args:
-        path: its folder.
+        path: the folder of the bundle.
         backend: "numpy"; "onnx", which runs policy.onnx with onnxruntime (extra `deploy`); or "jax".
 
     Raises:
-        DelayRLError: no bundle, a broken or foreign one, or a backend that is not installed.
+        DelayRLError: no bundle, a damaged or foreign one, or a backend that is not installed.
     """
     if backend not in BACKENDS:
         raise DelayRLError(f"unknown backend {backend!r}; there are {', '.join(BACKENDS)}")
@@ -108,4 +108,4 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
     try:
         return Bundle(network, metadata, onnx_policy(network, files[GRAPH], reference), backend)
     except DelayRLError as error:
-        raise DelayRLError(f"{Path(path) / GRAPH} is no policy of ours: {error}") from error
+        raise DelayRLError(f"{Path(path) / GRAPH} cannot be used: {error}") from error

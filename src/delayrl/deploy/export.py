@@ -1,4 +1,4 @@
-"""From a run folder to a bundle. Here, and nowhere else in `delayrl.deploy` but in its backend `jax`, JAX is needed."""
+"""Export a run folder as a bundle. Apart from the backend `jax`, only this module of the package needs JAX."""
 
 from pathlib import Path
 from typing import Any
@@ -11,30 +11,31 @@ from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.backends.onnx_graph import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
 from delayrl.envs import make
-from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, restored
-from delayrl.run.folder import Run, flatten_tree
+from delayrl.run.arrays import flatten_tree
+from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
+from delayrl.run.rows import check_row
 from delayrl.wrappers.single import seconds_of
 
 
 def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict[str, Any]:
-    """Write the policy of a run folder, from its newest good checkpoint, as a bundle.
+    """Write the policy in the newest good checkpoint of a run as a bundle.
 
     Args:
         run: the run folder.
         out: a new or empty folder.
-        force: replace a bundle that lies there.
+        force: replace a bundle in `out`.
 
     Returns:
-        What stands in its bundle.json, but the sums.
+        The content of bundle.json, without the checksums.
 
     Raises:
-        DelayRLError: no run, an agent without a deterministic policy, a folder that holds something else.
+        DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
     """
     check_target(Path(out), force=force)
     source = Run(Path(run))
-    config, checkpoint = source.config, source.latest()  # once: training may go on meanwhile
+    config, checkpoint = source.config, source.latest()  # read once, because training may continue
     policy = restored(config, checkpoint)
     metadata = describe(source, checkpoint.step, policy.spec.delay)
     write_files(Path(out), bundle_files(policy, metadata), force=force)
@@ -42,7 +43,7 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict
 
 
 def bundle_files(policy: Policy, metadata: dict[str, Any]) -> dict[str, bytes]:
-    """A bundle's files: the policy's network is described beside what `metadata` says."""
+    """Return the files of a bundle: the policy's weights and graph, and a bundle.json of `metadata` and the network."""
     network, arrays = network_of(policy)
     metadata = metadata | {"policy": network.document()}
     weights = safetensors.numpy.save(dict(sorted(arrays.items())))
@@ -52,12 +53,12 @@ def bundle_files(policy: Policy, metadata: dict[str, Any]) -> dict[str, bytes]:
 
 
 def network_of(policy: Policy) -> tuple[Network, Arrays]:
-    """The description and the arrays of the networks that give a policy's deterministic actions."""
+    """Return the description and the arrays of the networks that compute a policy's deterministic actions."""
     spec, parts = policy.spec, policy.agent.deterministic(policy.state)
     size = spec.action_size
 
     def mean(mlp: Any) -> Any:
-        """Without the outputs for the log-std, which a deterministic action does not need."""
+        """Drop the outputs for the log-std, which a deterministic action does not need."""
         *hidden, last = mlp
         return [*hidden, {"w": last["w"][:, :size], "b": last["b"][:size]}]
 
@@ -88,16 +89,16 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
 
 
 def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
-    """All that a bundle says of its run: task, spaces, seconds a step, delay, training, and the last evaluation."""
+    """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
     config = run.config
     env = make(config["env"], config["delay"])
     observations, actions = env.observation_space, env.action_space
     assert isinstance(observations, Box)
     assert isinstance(actions, Box)
     env.close()
-    kept = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
+    copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
-        **{name: config.get(name) for name in kept},
+        **{name: config.get(name) for name in copied},
         "ages": [0, longest],
         "action_delay": env.delay.action.maximum,
         "dt": seconds_of(env),
@@ -115,23 +116,19 @@ def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
 
 
 def _space(space: Box) -> dict[str, Any]:
-    """A Box as JSON can hold it; null where it has no bound."""
+    """Return a Box as JSON can hold it, with null for a missing bound."""
     low, high = ([float(x) if np.isfinite(x) else None for x in bound] for bound in (space.low, space.high))
     return {"shape": list(space.shape), "dtype": str(space.dtype), "low": low, "high": high}
 
 
 def _evaluation(run: Run, step: int) -> dict[str, Any] | None:
-    """Of the last evaluation up to the checkpoint; None where there was none yet."""
-    try:
-        rows = [row for row in run.read("rows") if row["policy"] == "agent" and int(row["step"]) <= step]
-        if not rows:
-            return None
-        last = max(int(row["step"]) for row in rows)
-        returns = [float(row["return"]) for row in rows if row["step"] == last]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise DelayRLError(f"{run.path / 'rows.jsonl'} is damaged: it holds a row that is none of ours") from error
-    if not np.isfinite(returns).all():
-        raise DelayRLError(f"{run.path / 'rows.jsonl'} holds a return that is not finite")
+    """Summarise the last evaluation up to the checkpoint at `step`; None if there was none."""
+    rows = [check_row(row, run.path / "rows.jsonl") for row in run.read("rows")]
+    rows = [row for row in rows if row["policy"] == "agent" and row["step"] <= step]
+    if not rows:
+        return None
+    last = max(row["step"] for row in rows)
+    returns = [row["return"] for row in rows if row["step"] == last]
     return {
         "step": last,
         "episodes": len(returns),

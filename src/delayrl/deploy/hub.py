@@ -1,4 +1,4 @@
-"""Bundles on the Hugging Face Hub, through `huggingface_hub` (extra `hub`), which keeps tokens and endpoints."""
+"""Push and pull bundles on the Hugging Face Hub. `huggingface_hub` (extra `hub`) holds tokens and endpoints."""
 
 import json
 import tempfile
@@ -8,24 +8,24 @@ from pathlib import Path
 from typing import Any
 
 from delayrl.deploy.files import DOCUMENT, GRAPH, LIMITS, WEIGHTS, check_files, check_target, read_files, write_files
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 
 CARD = "README.md"
 
 
 def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
-    """Upload a bundle, with a model card made from its metadata, as one commit; the repository is made where it lacks.
+    """Upload a bundle and a model card made from its metadata, as one commit. Creates the repository if needed.
 
     Args:
-        bundle: its folder; it is checked first.
+        bundle: the folder of the bundle, which is checked first.
         repo: OWNER/NAME.
-        private: of a new repository.
+        private: whether a new repository is private.
 
     Returns:
-        Where it lies.
+        The address of the repository.
 
     Raises:
-        DelayRLError: a broken bundle, no access, no network.
+        DelayRLError: a broken bundle, no access, or no network.
     """
     metadata, files = read_files(bundle, (WEIGHTS, GRAPH))
     check_files(bundle, metadata, files)
@@ -39,41 +39,46 @@ def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
 
 
 def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool = False) -> dict[str, Any]:
-    """Download a bundle, check it aside, and put it into a new or empty folder; no other file is asked for.
+    """Download a bundle and check it, then move it into a new or empty folder. No other file is requested.
+
+    Args:
+        repo: OWNER/NAME.
+        out: the folder.
+        revision: a branch, tag or commit; None for the default branch.
+        force: replace a bundle in `out`.
 
     Returns:
-        Its metadata.
+        The content of bundle.json.
 
     Raises:
-        DelayRLError: no such repository, no bundle in it, a broken one, a folder that holds something else.
+        DelayRLError: no such repository, no bundle in it or a broken one, or a folder that holds something else.
     """
     check_target(Path(out), force=force)
     _, api = _hub()
     names = [DOCUMENT, WEIGHTS, GRAPH]
-    with tempfile.TemporaryDirectory(prefix="delayrl-pull-") as aside:
+    with tempfile.TemporaryDirectory(prefix="delayrl-pull-") as folder:
         with _one_line(f"cannot pull from {repo}"):
-            sizes = {
-                item.path: getattr(item, "size", None) for item in api.get_paths_info(repo, names, revision=revision)
-            }
+            paths = api.get_paths_info(repo, names, revision=revision)
+            sizes = {path.path: getattr(path, "size", None) for path in paths}
         for name in (name for name in names if name in sizes):
             size = sizes[name]
             if not isinstance(size, int) or size > LIMITS[name]:
-                raise DelayRLError(f"{name} in {repo} is no file, or larger than {LIMITS[name]:,} bytes")
+                raise DelayRLError(f"{name} in {repo} is not a file, or is larger than {LIMITS[name]:,} bytes")
             with _one_line(f"cannot pull {name} from {repo}"):
-                api.hf_hub_download(repo, name, revision=revision, local_dir=aside)
+                api.hf_hub_download(repo, name, revision=revision, local_dir=folder)
         if DOCUMENT not in sizes:
             raise DelayRLError(f"{repo} holds no policy bundle: it has no {DOCUMENT}")
         try:
-            metadata, files = read_files(aside, (WEIGHTS, GRAPH))
-            check_files(aside, metadata, files)
+            metadata, files = read_files(folder, (WEIGHTS, GRAPH))
+            check_files(folder, metadata, files)
         except DelayRLError as error:
-            raise DelayRLError(str(error).replace(aside, repo)) from error
+            raise DelayRLError(str(error).replace(folder, repo)) from error
     write_files(Path(out), files, force=force)
     return metadata
 
 
 def card(metadata: Mapping[str, Any], repo: str) -> str:
-    """The model card: what the metadata says, and how to use it."""
+    """Return the model card: the metadata as a table, and how to use the bundle."""
     policy, evaluation = metadata["policy"], metadata.get("evaluation")
     agent, env, delay = (plain(metadata.get(name)) for name in ("agent", "env", "delay"))
     head: dict[str, Any] = {"library_name": "delayrl", "pipeline_tag": "reinforcement-learning"}
@@ -118,7 +123,7 @@ def card(metadata: Mapping[str, Any], repo: str) -> str:
 
 
 def plain(value: Any) -> str:
-    """A value in a cell of a table: one short line without markup."""
+    """Return a value as the cell of a table: one short line without markup."""
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return "".join(c for c in text if c.isprintable() and c not in "|<>`[]")[:80]
 
@@ -127,7 +132,7 @@ def _hub() -> tuple[Any, Any]:
     try:
         import huggingface_hub
     except ImportError as error:
-        raise DelayRLError("the hub takes the package huggingface_hub: pip install 'delayrl[hub]'") from error
+        raise DelayRLError("the hub needs the package huggingface_hub: pip install 'delayrl[hub]'") from error
     return huggingface_hub, huggingface_hub.HfApi()
 
 
@@ -135,6 +140,5 @@ def _hub() -> tuple[Any, Any]:
 def _one_line(what: str) -> Iterator[None]:
     try:
         yield
-    except Exception as error:  # of the network, of its client, of its client's client: all end here
-        line = "".join(filter(str.isprintable, (str(error).strip().splitlines() or [""])[0]))
-        raise DelayRLError(f"{what}: {line[:200] or type(error).__name__}") from error
+    except Exception as error:  # the client passes on the exceptions of its own libraries
+        raise DelayRLError(f"{what}: {''.join(filter(str.isprintable, first_line(error)))[:200]}") from error

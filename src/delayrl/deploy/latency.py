@@ -1,4 +1,4 @@
-"""How long one decision takes: one process for each backend, one thread, one core."""
+"""Measure how long one decision takes: one process for each backend, one thread, one core."""
 
 import json
 import os
@@ -24,24 +24,24 @@ ONE_THREAD = {
 
 
 def ages_of(longest: int) -> list[int]:
-    """The ages that are measured: those of `AGES` that the policy serves, and its longest."""
+    """Return the ages to measure: those of `AGES` that the policy serves, and its longest."""
     return sorted({age for age in AGES if age <= longest} | {longest})
 
 
 def latency(
     bundle: str | Path, backend: str, *, decisions: int = 2000, ages: Sequence[int] | None = None
 ) -> list[dict[str, Any]]:
-    """Time decisions in a process of its own, back to back, each on new numbers; the first ones are not counted.
+    """Time decisions back to back in a new process, each on new numbers, after a warm-up.
 
     Args:
-        bundle: its folder.
+        bundle: the folder of the bundle.
         backend: one of `BACKENDS`.
-        decisions: how many for each age.
-        ages: which; None for `ages_of` the bundle's longest.
+        decisions: how many to time for each age.
+        ages: in steps; None for `ages_of` the policy's longest.
 
     Returns:
-        For each age `age`, `decisions`, `p50`, `p99`, `max`, and `processor_p99`, in milliseconds. The last one leaves
-        out the time in which the processor did something else.
+        A row for each age: `age` and `decisions`, and `p50`, `p99`, `max` and `processor_p99` in milliseconds. The last
+        one leaves out the time in which the processor did something else.
 
     Raises:
         DelayRLError: a broken bundle, an age that it does not serve, or a backend that is not installed.
@@ -49,7 +49,7 @@ def latency(
     if not 1 <= decisions <= 10_000_000:
         raise DelayRLError(f"decisions must lie in 1 .. 10,000,000; got {decisions}")
     task = json.dumps([str(bundle), backend, decisions, None if ages is None else list(ages)])
-    # -P: a module that lies in this folder, which may be the bundle's, is not ours
+    # -P: do not import modules from the working folder, which may be the bundle's
     command = [sys.executable, "-P", "-m", "delayrl.deploy.latency", task]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, capture_output=True, text=True)
     if done.returncode:
@@ -58,7 +58,7 @@ def latency(
 
 
 def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | None) -> list[dict[str, Any]]:
-    """The same in this process."""
+    """Time decisions in this process; see `latency`."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     policy = load_bundle(bundle, backend)
@@ -66,7 +66,7 @@ def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | Non
     for age in ages_of(policy.max_age) if ages is None else ages:
         if not 0 <= age <= policy.max_age:
             raise DelayRLError(f"the policy was trained for ages 0..{policy.max_age}; got {age}")
-        taken = np.zeros((2, decisions))
+        times = np.zeros((2, decisions))  # milliseconds by the clock, and of the processor
         for i in range(-WARM_UP, decisions):
             obs = random.standard_normal(policy.obs_size, np.float32)
             actions = np.zeros((policy.max_age, policy.action_size), np.float32)
@@ -74,25 +74,24 @@ def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | Non
             worked, began = time.process_time(), time.perf_counter()
             policy(obs, actions, age)
             if i >= 0:
-                taken[:, i] = 1000 * (time.perf_counter() - began), 1000 * (time.process_time() - worked)
-        p50, p99 = np.percentile(taken[0], [50, 99])
-        quantiles = {"p50": p50, "p99": p99, "max": taken[0].max(), "processor_p99": np.percentile(taken[1], 99)}
+                times[:, i] = 1000 * (time.perf_counter() - began), 1000 * (time.process_time() - worked)
+        p50, p99 = np.percentile(times[0], [50, 99])
+        quantiles = {"p50": p50, "p99": p99, "max": times[0].max(), "processor_p99": np.percentile(times[1], 99)}
         rows.append({"age": age, "decisions": decisions, **quantiles})
     return rows
 
 
 def available(backend: str) -> bool:
-    """Whether what a backend needs is installed."""
+    """Whether the packages of a backend are installed."""
     from importlib.util import find_spec
 
     return find_spec({"numpy": "numpy", "onnx": "onnxruntime", "jax": "jax"}[backend]) is not None
 
 
 def table(rows: dict[str, list[dict[str, Any]]], period: float | None) -> tuple[list[str], list[list[str]]]:
-    """Head and cells of what is printed: rows by backend, and the control period in milliseconds."""
-    head = ["backend", "age", "p50 ms", "p99 ms", "max ms", "p99 of processor time"] + (
-        ["p99 of the period"] if period else []
-    )
+    """Return the head and cells of a table, from the rows of each backend and the control period in milliseconds."""
+    head = ["backend", "age", "p50 ms", "p99 ms", "max ms", "p99 of processor time"]
+    head += ["p99 of the period"] if period else []
     cells = [
         [backend, str(row["age"]), *(f"{row[name]:.3f}" for name in ("p50", "p99", "max", "processor_p99"))]
         + ([f"{row['p99'] / period:.1%}"] if period else [])

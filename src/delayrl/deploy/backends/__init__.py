@@ -1,1 +1,1 @@
-"""One network, computed by NumPy, ONNX Runtime or JAX."""
+"""The network of a bundle, computed by NumPy, ONNX Runtime or JAX."""

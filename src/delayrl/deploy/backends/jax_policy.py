@@ -1,4 +1,4 @@
-"""A bundle's policy with the networks that trained it: for comparison, and where JAX is at hand anyway."""
+"""Compute a bundle's policy with the networks that trained it: for comparison, or where JAX is installed anyway."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from delayrl.deploy.backends.network import Act, Arrays, Network
 
 
 def jax_policy(network: Network, arrays: Arrays) -> Act:
-    """A function of (obs [S], actions [Δ, A], age), as `Bundle` has it; compiled by its first call."""
+    """Return the policy as a function, which its first call compiles."""
     params = _tree(arrays)
     low, high = jnp.asarray(network.low), jnp.asarray(network.high)
 
@@ -40,7 +40,7 @@ def jax_policy(network: Network, arrays: Arrays) -> Act:
 
 
 def _tree(arrays: Arrays) -> Any:
-    """Names with dots as nested dictionaries, and as lists where the names are numbers."""
+    """Split names at their dots: return nested dictionaries, or lists where the names are numbers."""
     root: dict[str, Any] = {}
     for name, array in arrays.items():
         *path, leaf = name.split(".")

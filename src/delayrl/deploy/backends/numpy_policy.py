@@ -1,14 +1,15 @@
-"""A bundle's policy in NumPy, arranged so that one decision costs little.
+"""Compute a bundle's policy in NumPy, at a low cost per decision.
 
-`fold` rewrites the encoder without changing what it computes; each step is an identity of linear algebra:
+`fold` rewrites the encoder without changing what it computes. Each step is an identity of linear algebra:
 
-- The embeddings of observation and action, their join and the biases are three arrays: `obs`, `action`, `position`.
-- There is one attention head, so q·k = (x W_q + b_q)·(x' W_k + b_k) is x M x' + c·x', up to terms that are the same for
-  all keys and that the softmax does not see: M = W_q W_kᵀ/√width. In the same way value and output are one matrix.
-- Scale and shift of the second layer norm of a block, and of the last one, go into the layer that follows.
+- Three arrays, `obs`, `action` and `position`, replace the embeddings of observation and action, their join and the
+  biases.
+- There is one attention head, so q·k = (x W_q + b_q)·(x' W_k + b_k) is x M x' + c·x' with M = W_q W_kᵀ/√width, up to
+  terms that are the same for all keys and cancel in the softmax. Value and output become one matrix in the same way.
+- The layer that follows takes in the scale and shift of the second layer norm of a block, and of the last one.
 
-Four square products for each token and block remain, of six. Only positions 0..age - 1 are computed, and in the last
-block only the last of them, since it alone is read.
+Of six square products for each token and block, four remain. Only positions 0..age - 1 are computed, and in the last
+block only the last of them, because no other is read.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from delayrl.deploy.backends.network import Act, Arrays, Network
 
 Array = NDArray[Any]
-"""Always of float32 here."""
+"""An array of float32, everywhere in this file but inside `fold`."""
 Layer = tuple[Array, Array]
 
 
@@ -45,7 +46,7 @@ class Encoder(NamedTuple):
 
 
 def numpy_policy(network: Network, arrays: Arrays) -> Act:
-    """A function of (obs [S], actions [Δ, A], age), as `Bundle` has it."""
+    """Return the policy as a function."""
     low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
     gain, half = 2 / (high - low), (high - low) / 2
     current = layers(arrays, "current")
@@ -70,26 +71,26 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
 
 
 def layers(arrays: Arrays, name: str) -> list[Layer]:
-    """The (w, b) of an MLP; none where there is no such MLP."""
+    """Return the (w, b) of each layer of an MLP; an empty list if there is no such MLP."""
     count = sum(key.startswith(f"{name}.") for key in arrays) // 2
     return [(arrays[f"{name}.{i}.w"], arrays[f"{name}.{i}.b"]) for i in range(count)]
 
 
 def fold(network: Network, arrays: Arrays) -> tuple[Encoder, list[Layer]]:
-    """The encoder as it is computed, and the head behind it. Products are in double precision, rounded once."""
-    wide = {name: array.astype(np.float64) for name, array in arrays.items()}
+    """Return the folded encoder, and the head that follows it. Products are in double precision, rounded once."""
+    double = {name: array.astype(np.float64) for name, array in arrays.items()}
     width = network.width
 
     def layer(w: Any, b: Any) -> Layer:
         return np.ascontiguousarray(w, np.float32), np.ascontiguousarray(b, np.float32)
 
     def behind(norm: str, w: Any, b: Any) -> Layer:
-        """A linear layer that follows a layer norm, with the norm's scale and shift in it."""
-        return layer(wide[f"{norm}.scale"][:, None] * w, b + wide[f"{norm}.shift"] @ w)
+        """Fold a layer norm's scale and shift into the linear layer that follows it."""
+        return layer(double[f"{norm}.scale"][:, None] * w, b + double[f"{norm}.shift"] @ w)
 
     blocks = []
     for i in range(network.blocks):
-        part = {name.removeprefix(f"encoder.blocks.{i}."): a for name, a in wide.items()}
+        part = {name.removeprefix(f"encoder.blocks.{i}."): a for name, a in double.items()}
         w_query, w_key, w_value = np.split(part["qkv.w"], 3, 1)
         b_query, _, b_value = np.split(part["qkv.b"], 3)
         blocks.append(
@@ -101,12 +102,12 @@ def fold(network: Network, arrays: Arrays) -> tuple[Encoder, list[Layer]]:
                 layer(part["mlp.1.w"], part["mlp.1.b"]),
             )
         )
-    of_obs, of_action = np.split(wide["encoder.join.w"], 2)
-    bias = wide["encoder.obs.b"] @ of_obs + wide["encoder.action.b"] @ of_action + wide["encoder.join.b"]
-    obs, position = layer(wide["encoder.obs.w"] @ of_obs, wide["encoder.position"] + bias)
-    action = np.ascontiguousarray(wide["encoder.action.w"] @ of_action, np.float32)
-    norm_in = layer(wide["encoder.norm_in.scale"], wide["encoder.norm_in.shift"])
-    head = [behind("encoder.norm_out", wide["head.0.w"], wide["head.0.b"]), *layers(arrays, "head")[1:]]
+    of_obs, of_action = np.split(double["encoder.join.w"], 2)
+    bias = double["encoder.obs.b"] @ of_obs + double["encoder.action.b"] @ of_action + double["encoder.join.b"]
+    obs, position = layer(double["encoder.obs.w"] @ of_obs, double["encoder.position"] + bias)
+    action = np.ascontiguousarray(double["encoder.action.w"] @ of_action, np.float32)
+    norm_in = layer(double["encoder.norm_in.scale"], double["encoder.norm_in.shift"])
+    head = [behind("encoder.norm_out", double["head.0.w"], double["head.0.b"]), *layers(arrays, "head")[1:]]
     return Encoder(obs, action, position, norm_in, blocks), head
 
 
@@ -118,7 +119,7 @@ def _mlp(layers: list[Layer], x: Array) -> Array:
 
 
 def _encode(encoder: Encoder, obs: Array, actions: Array) -> Array:
-    """The last token's output before scale and shift of the last norm, [width]."""
+    """Return the last token's output, [width], before the scale and shift of the last norm."""
     age = len(actions)
     x = actions @ encoder.action
     x += encoder.position[:age]
@@ -149,7 +150,7 @@ def _encode(encoder: Encoder, obs: Array, actions: Array) -> Array:
 
 
 def _normalised(x: Array) -> Array:
-    """Mean 0 and variance 1 along the last axis; ε = 1e-5."""
+    """Normalise to mean 0 and variance 1 along the last axis; ε = 1e-5."""
     x = x - x.mean(-1, keepdims=True)
     variance = np.einsum("...i,...i->...", x, x)[..., None] / np.float32(x.shape[-1])
     x *= 1 / np.sqrt(variance + np.float32(1e-5))
@@ -157,7 +158,7 @@ def _normalised(x: Array) -> Array:
 
 
 def _gelu(x: Array) -> Array:
-    """The GELU x Φ(x). The error function by Abramowitz & Stegun 7.1.26, within 1.5e-7: NumPy has none."""
+    """Compute the GELU x Φ(x). NumPy has no error function: Abramowitz & Stegun 7.1.26 is exact to 1.5e-7."""
     half = np.abs(x) * np.float32(0.5**0.5)
     t = 1 / (1 + np.float32(0.3275911) * half)
     tail = t * np.float32(1.061405429)

@@ -1,7 +1,7 @@
-"""A bundle's policy as an ONNX graph, built node by node: (obs [S], actions [Δ, A], age []) -> action [A].
+"""Build a bundle's policy as an ONNX graph, node by node: (obs [S], actions [Δ, A], age []) -> action [A].
 
-It keeps no state, takes and gives the task's own units, and holds the bundle's metadata. It computes what
-`numpy_policy` computes, in the same folded form, with operators of opset 17 alone: no control flow, no custom ones.
+The graph is stateless, works in the task's units, and holds the bundle's metadata. It computes the same folded form as
+`numpy_policy`. It uses standard operators of opset 17 only, without control flow.
 """
 
 import json
@@ -19,14 +19,14 @@ OPSET, IR = 17, 8
 
 
 class Graph:
-    """Nodes and constants, named in the order in which they are made."""
+    """Collect nodes and constants. Their names number them in order of creation."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
 
     def constant(self, value: ArrayLike, kind: Any = np.float32) -> str:
-        """An array as an input for nodes."""
+        """Add an array; return its name, an input for nodes."""
         from onnx import numpy_helper
 
         name = f"c{len(self.constants)}"
@@ -34,7 +34,7 @@ class Graph:
         return name
 
     def __call__(self, operator: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
-        """One node; returns the name of its output."""
+        """Add a node; return the name of its output."""
         from onnx import helper
 
         output = output or f"x{len(self.nodes)}"
@@ -42,23 +42,23 @@ class Graph:
         return output
 
     def linear(self, layer: Layer, x: str) -> str:
-        """X w + b."""
+        """Add x w + b; return its name."""
         return self("Add", self("MatMul", x, self.constant(layer[0])), self.constant(layer[1]))
 
     def mlp(self, layers: list[Layer], x: str) -> str:
-        """ReLU between the layers."""
+        """Add an MLP with ReLU between its layers; return its name."""
         for layer in layers[:-1]:
             x = self("Relu", self.linear(layer, x))
         return self.linear(layers[-1], x)
 
 
 def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) -> bytes:
-    """The serialised model. Raises DelayRLError where the package `onnx` is not installed."""
+    """Return the serialised model. Raises DelayRLError if the package `onnx` is not installed."""
     try:
         import onnx
         from onnx import TensorProto, helper
     except ImportError as error:
-        raise DelayRLError("to export a policy takes the package onnx: pip install 'delayrl[deploy]'") from error
+        raise DelayRLError("exporting a policy needs the package onnx: pip install 'delayrl[deploy]'") from error
     graph = Graph()
     low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
     row = graph("Reshape", "obs", graph.constant([1, network.obs_size], np.int64))
@@ -73,8 +73,8 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
             encoder, head = fold(network, arrays)
             raw = graph.mlp(head, _encoded(graph, encoder, row, scaled))
     if current := layers(arrays, "current"):
-        late = graph("Greater", "age", graph.constant(0, np.int64))
-        raw = graph("Where", late, raw, graph.mlp(current, row))
+        delayed = graph("Greater", "age", graph.constant(0, np.int64))
+        raw = graph("Where", delayed, raw, graph.mlp(current, row))
     unit = graph("Reshape", graph("Tanh", raw), graph.constant([network.action_size], np.int64))
     gained = graph("Mul", graph("Add", unit, graph.constant(1)), graph.constant((high - low) / 2))
     graph("Add", gained, graph.constant(low), output="action")
@@ -91,8 +91,8 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR,
     )
-    told = json.dumps(metadata, sort_keys=True).replace("location", "l\\u006fcation")  # see onnx_policy.LOCATION
-    helper.set_model_props(model, {"delayrl": told})
+    text = json.dumps(metadata, sort_keys=True).replace("location", "l\\u006fcation")  # see onnx_policy.LOCATION
+    helper.set_model_props(model, {"delayrl": text})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
 
@@ -106,10 +106,10 @@ def _augmented(graph: Graph, network: Network, row: str, scaled: str) -> str:
 
 
 def _encoded(graph: Graph, encoder: Encoder, row: str, scaled: str) -> str:
-    """The last token's output, [1, width]. At age 0 that of one token is computed, and not used."""
+    """Return the last token's output, [1, width]. At age 0 it is computed from one token, and not used."""
     width = encoder.obs.shape[1]
     ones, zeros = np.ones(width, np.float32), np.zeros(width, np.float32)
-    start, many = graph.constant([0], np.int64), graph.constant([2**31], np.int64)
+    start, end = graph.constant([0], np.int64), graph.constant([2**31], np.int64)
     age = graph("Reshape", graph("Max", "age", graph.constant(1, np.int64)), graph.constant([1], np.int64))
 
     def norm(x: str, scale: ArrayLike = ones, shift: ArrayLike = zeros) -> str:
@@ -125,7 +125,7 @@ def _encoded(graph: Graph, encoder: Encoder, row: str, scaled: str) -> str:
     for i, block in enumerate(encoder.blocks):
         asking = x = norm(x, block.scale, block.shift)
         if i == len(encoder.blocks) - 1:
-            asking = graph("Slice", x, graph.constant([-1], np.int64), many, start)
+            asking = graph("Slice", x, graph.constant([-1], np.int64), end, start)
         scores = graph("MatMul", graph.linear(block.attend, asking), graph("Transpose", x, perm=[1, 0]))
         if i < len(encoder.blocks) - 1:
             scores = graph("Add", scores, future)

@@ -1,4 +1,4 @@
-"""A bundle's policy.onnx, run by onnxruntime on one thread."""
+"""Run a bundle's policy.onnx with onnxruntime, on one thread."""
 
 from typing import Any
 
@@ -6,22 +6,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.deploy.backends.network import Act, Network
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 
 LOCATION = b"location"
-"""The key by which a graph names another file for its numbers. Older versions of onnxruntime would read any file."""
+"""The key with which a graph refers to a file with its numbers. Older versions of onnxruntime would read any file."""
 
 
 def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
-    """A function of (obs [S], actions [Δ, A], age), as `Bundle` has it.
+    """Return the policy in the graph as a function.
 
-    A graph from elsewhere is run in no other way than on arrays: it must take and give what ours do, and agree with
-    `reference`, the policy in the weights, on a few inputs.
+    The graph may come from anywhere. Its inputs and outputs must be those of our graphs, and its actions must agree
+    with `reference`, the policy in the weights, on a few inputs.
+
+    Raises:
+        DelayRLError: onnxruntime is not installed, or the graph is not this policy.
     """
     try:
         import onnxruntime
     except ImportError as error:
-        raise DelayRLError("the backend onnx takes the package onnxruntime: pip install 'delayrl[deploy]'") from error
+        raise DelayRLError("the backend onnx needs the package onnxruntime: pip install 'delayrl[deploy]'") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
@@ -31,15 +34,15 @@ def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own exceptions have no common name
-        raise DelayRLError(f"onnxruntime cannot load it ({_line(error)})") from error
-    found = [(x.name, x.type, x.shape) for x in (*session.get_inputs(), *session.get_outputs())]
+        raise DelayRLError(f"onnxruntime cannot load it ({_quoted(error)})") from error
+    given = [(x.name, x.type, x.shape) for x in (*session.get_inputs(), *session.get_outputs())]
     expected: list[Any] = [
         ("obs", "tensor(float)", [network.obs_size]),
         ("actions", "tensor(float)", [network.max_age, network.action_size]),
         ("age", "tensor(int64)", []),
         ("action", "tensor(float)", [network.action_size]),
     ]
-    if found != expected:
+    if given != expected:
         raise DelayRLError("its inputs and outputs are not obs, actions, age and action in the policy's sizes")
 
     def act(obs: NDArray[np.float32], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
@@ -53,11 +56,11 @@ def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
         try:
             same = np.abs(act(obs, actions, age) - reference(obs, actions, age)) <= 1e-3 * (high - low)
         except Exception as error:
-            raise DelayRLError(f"it does not run ({_line(error)})") from error
+            raise DelayRLError(f"it does not run ({_quoted(error)})") from error
         if not same.all():
             raise DelayRLError("it gives other actions than the weights beside it")
     return act
 
 
-def _line(error: Exception) -> str:
-    return repr((str(error).strip().splitlines() or [type(error).__name__])[0][:120])  # which may quote the graph
+def _quoted(error: Exception) -> str:
+    return repr(first_line(error)[:120])  # it may contain text of the graph
