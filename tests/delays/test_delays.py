@@ -22,6 +22,7 @@ from delayrl.delays import (
     poisson,
     random_walk,
     recorded,
+    short_label,
     uniform,
 )
 from delayrl.errors import DelayRLError
@@ -29,7 +30,7 @@ from strategies import DELAYS, LAWS
 
 
 def drawn(law: object, count: int, seed: int = 0) -> list[int]:
-    """One long episode."""
+    """Draw the delays of one long episode."""
     random, state, values = np.random.default_rng(seed), 0, []
     for _ in range(count):
         value, state = law.draw(state, random)  # type: ignore[attr-defined]
@@ -39,6 +40,7 @@ def drawn(law: object, count: int, seed: int = 0) -> list[int]:
 
 @given(DELAYS)
 def test_text_round_trip(delay: Delay) -> None:
+    assert short_label(delay.plain()) == short_label(delay.label()) == delay.label()
     assert as_delay(delay.plain()) == delay
     assert as_delay(str(delay)) == delay
     assert len(str(delay.label())) <= max(len(str(delay.plain())), 12)
@@ -62,7 +64,7 @@ def test_laws_stay_in_their_range_and_shift(law: object, more: int, seed: int) -
     ],
 )
 def test_frequencies(law: Choice | Markov, expected: dict[int, float]) -> None:
-    """Each law's long-run share of every delay; and from the first draw of an episode on."""
+    """The share of every delay, in the long run and in the first draw of an episode."""
     counts = np.bincount(drawn(law, 40_000), minlength=7) / 40_000
     first = np.bincount([law.draw(0, np.random.default_rng(seed))[0] for seed in range(4000)], minlength=7) / 4000
     for k in range(7):
@@ -81,13 +83,13 @@ def test_truncated_distributions_against_scipy() -> None:
 
 
 def test_bursts() -> None:
-    """In a Gilbert-Elliott network bad delays come in runs of mean 1 / recover; independent draws have none."""
+    """Bad delays of a Gilbert-Elliott network come in runs of mean length 1 / recover."""
     values = np.array(drawn(gilbert_elliott(0, 1, 0.05, 0.2), 50_000))
     starts = ((values[1:] == 1) & (values[:-1] == 0)).sum()
     assert values.sum() / starts == pytest.approx(5, rel=0.1)
     steps = np.abs(np.diff(drawn(random_walk(9, 0.5), 20_000)))
     assert set(steps) == {0, 1}
-    assert steps.mean() == pytest.approx(0.5 * 0.9, abs=0.02)  # at the two of ten ends half of the moves stay
+    assert steps.mean() == pytest.approx(0.5 * 0.9, abs=0.02)  # at 2 of 10 states half of the moves are not taken
 
 
 def test_recorded_goes_on_in_order_from_a_random_place() -> None:
@@ -216,7 +218,7 @@ def test_recordings_in_odd_forms(tmp_path: Path) -> None:
             recorded(tmp_path / name)
 
 
-def test_what_a_newcomer_types() -> None:
+def test_shorthands() -> None:
     assert Delay(observation=3, action="2") == as_delay("3+action=2")  # type: ignore[arg-type]
     assert Channel(3) == Channel(Constant(3))  # type: ignore[arg-type]
     assert as_delay(" 2 + action = 1 ") == as_delay("2+action=1")
@@ -226,8 +228,8 @@ def test_what_a_newcomer_types() -> None:
     assert len(str(as_delay("choice:" + ",".join(f"{i}={1 / 50!r}" for i in range(50))).label())) < 60
 
 
-def test_recordings_are_data(tmp_path: Path) -> None:
-    """A .npy file with pickled objects is refused, and nothing in it runs."""
+def test_recordings_run_no_code(tmp_path: Path) -> None:
+    """A .npy file with pickled objects is refused, and its code does not run."""
     np.save(tmp_path / "trace.npy", np.array([object()]), allow_pickle=True)
     (tmp_path / "cut.npy").write_bytes(b"\x93NUMPY")
     for name in ("trace.npy", "cut.npy"):
@@ -235,7 +237,7 @@ def test_recordings_are_data(tmp_path: Path) -> None:
             recorded(tmp_path / name)
 
 
-def test_what_is_no_delay() -> None:
+def test_values_that_are_no_delay() -> None:
     for given_ in (True, None, [1], 2.5):
         with pytest.raises(DelayRLError, match="whole"):
             as_delay(given_)  # type: ignore[arg-type]

@@ -21,10 +21,10 @@ from delayrl.errors import DelayRLError
 GOLDEN = np.load(Path(__file__).parents[1] / "data" / "golden-mujoco-2.3.7.npz", allow_pickle=False)
 MUJOCO = tuple(int(part) for part in re.findall(r"\d+", mujoco.__version__)[:3])
 
-# Steps of an episode that are compared, and what observations and rewards may differ by. The differences have
-# three causes: contact is chaotic (in HalfCheetah an impact makes rounding errors 10 times larger); the PGS
-# solver of the two Humanoids stops before it has converged, and since MuJoCo 3.3.6 it starts, and since 3.8.1
-# sweeps, otherwise; from the 7th step on HumanoidStandup has contacts that 2.3.7 overlooked (see below).
+# How many steps of an episode are compared, and how far observations and rewards may differ. There are three causes.
+# Contact is chaotic: in HalfCheetah an impact makes rounding errors 10 times larger. The PGS solver of both Humanoids
+# stops before it converges, and it starts differently since MuJoCo 3.3.6 and sweeps differently since 3.8.1. From the
+# 7th step on HumanoidStandup has contacts that 2.3.7 overlooked (see below).
 AGREEMENT = {
     "Ant": (40, 1e-8, 1e-8),
     "HalfCheetah": (20, 1e-7, 1e-8),
@@ -65,7 +65,7 @@ def unpatched(task: str) -> gymnasium.Env:
 
 
 def differences(env: gymnasium.Env, task: str, episode: str) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Replay: the largest difference of each observation [T + 1], of each reward [T]; do the ends agree?"""
+    """Replay an episode: the largest difference of each observation [T + 1] and reward [T]; whether the ends agree."""
     golden = {name: GOLDEN[f"{task}/{episode}/{name}"] for name in ("observations", "rewards", "terminated")}
     observations, rewards, ends = [env.reset(seed=int(GOLDEN[f"{task}/{episode}/seed"]))[0]], [], []
     for action in GOLDEN[f"{task}/{episode}/actions"]:
@@ -81,12 +81,12 @@ def differences(env: gymnasium.Env, task: str, episode: str) -> tuple[np.ndarray
 def agrees(env: gymnasium.Env, task: str, episode: str) -> bool:
     steps, observation_tolerance, reward_tolerance = AGREEMENT[task]
     observations, rewards, same_end = differences(env, task, episode)
-    whole = steps >= len(rewards)
+    covers_end = steps >= len(rewards)
     return bool(
         observations[0] < 1e-12
         and observations[: steps + 1].max() < observation_tolerance
         and rewards[:steps].max() < reward_tolerance
-        and (same_end or not whole)
+        and (same_end or not covers_end)
     )
 
 
@@ -173,10 +173,10 @@ def test_terminal_step_pays_the_healthy_reward(task: str, healthy: float) -> Non
 
 @pytest.fixture
 def _overlook_contacts() -> Iterator[None]:
-    """MuJoCo 2.3.3 to 2.3.7 left the margin out of a bounding-sphere test (changelog 3.0.0, item 33).
+    """Overlook contacts as MuJoCo 2.3.3 to 2.3.7, which left the margin out of a test (changelog 3.0.0, item 33).
 
-    It is made for pairs of bodies that have more than one pair of geoms. Spheres then touch only when they
-    overlap, not from a distance of one margin.
+    The test is for pairs of bodies that have more than one pair of geoms. Their bounding spheres then touch only when
+    they overlap, not from a distance of one margin.
     """
 
     def overlooked(model: Any, data: Any, geom1: int, geom2: int) -> int:
@@ -198,7 +198,7 @@ def _overlook_contacts() -> Iterator[None]:
 def test_humanoid_standup_differs_by_what_mujoco_2_overlooked(episode: str) -> None:
     _, rewards, _ = differences(make("HumanoidStandup"), "HumanoidStandup", episode)
     assert len(rewards) == 20
-    assert rewards.max() < 1e-3  # 0.3 without the overlooked contacts; solver convergence is what remains
+    assert rewards.max() < 1e-3  # 0.3 without this; the solver's convergence remains
 
 
 @pytest.mark.parametrize("task", paper.TASKS)

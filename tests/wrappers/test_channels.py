@@ -1,4 +1,4 @@
-"""What the wrapper shows equals a brute-force account of every message, for every law, rule and channel."""
+"""The wrappers equal a brute-force account of every message, for every law, rule and channel."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from strategies import DELAYS
 
 
 class Journal(gym.Env):
-    """Observation [t, the action that acted]; the reward of step t is 2**t, so that any sum tells its parts."""
+    """Observation [t, the action that acted]; the reward of step t is 2**t, so that each sum shows its parts."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
     action_space = gym.spaces.Box(-1, 1, (1,))
@@ -33,25 +33,20 @@ class Journal(gym.Env):
     def step(self, action):
         self.acted.append(float(action[0]))
         t = len(self.acted)
-        assert t <= self.length, "an episode that is over is not stepped"
+        assert t <= self.length, "stepped after its end"
         end = t == self.length
         return np.array([t, action[0]]), 2.0 ** (t - 1), end and not self.truncates, end and self.truncates, {}
 
 
-def travel_times(law: Any, memory: list[int], random: np.random.Generator) -> int:
-    value, memory[0] = law.draw(memory[0], random)
-    return value
-
-
 def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[float], seed: int) -> list[dict]:
-    """Every message with its time of arrival, kept for ever; and at each step what of it counts."""
+    """Keep every message with its time of arrival, and work out what counts at each step."""
     random = np.random.default_rng([seed, 1])
-    memories = {name: [0] for name in ("action", "observation", "reward")}
+    states = {"action": 0, "observation": 0, "reward": 0}  # of the laws
     sent: dict[str, list[tuple[int, int]]] = {"action": [], "observation": [], "reward": []}  # (made, arrives)
 
     def send(name: str, made: int) -> int:
         channel = getattr(delay, name)
-        travel = travel_times(channel.law, memories[name], random)
+        travel, states[name] = channel.law.draw(states[name], random)
         arrives = made + travel
         if channel.rule == "fifo":
             arrives = max([arrives, *(a for _, a in sent[name])])
@@ -70,17 +65,17 @@ def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[
     else:
         shown = counts("observation", 0, send("observation", 0))
     rows = [{"shown": shown, "truth": truth[0], "reward": None, "end": (False, False)}]
-    acted_on: list[int] = [0]  # how late the action was that led to each state
+    applied: list[int] = [0]  # the age of the action that led to each state
     paid: set[int] = set()
     end = None
     for t, _ in enumerate(issued):
         number = t
         if delay.action.maximum:
             number = counts("action", t, send("action", t))
-        late = min(t - number, delay.action.maximum)
-        acted_on.append(late)
+        age = min(t - number, delay.action.maximum)
+        applied.append(age)
         if end is None:
-            truth.append(np.array([t + 1.0, issued[t - late] if t - late >= 0 else 0.0]))
+            truth.append(np.array([t + 1.0, issued[t - age] if t >= age else 0.0]))
         else:
             truth.append(truth[-1])
         now = t + 1
@@ -107,14 +102,14 @@ def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[
         row["age"] = t - max(row["shown"], 0) + delay.action.maximum
         first = t - row["age"]
         row["actions"] = [issued[i] if i >= 0 else 0.0 for i in range(first, t)]
-        row["late"] = acted_on[row["shown"]] if row["shown"] >= 0 else 0
+        row["applied"] = applied[row["shown"]] if row["shown"] >= 0 else 0
     return rows
 
 
 @settings(max_examples=400, deadline=None)
 @given(DELAYS, st.sampled_from(["first", "zeros"]), st.integers(1, 25), st.booleans(), st.integers(0, 99))
 def test_equals_the_account(delay: Delay, fill: str, length: int, truncates: bool, seed: int) -> None:
-    """Observations, ages, histories, what acts, rewards and the end; and a second episode after it."""
+    """Observations, ages, histories, actions in force, rewards and the end, in two episodes."""
     env = Delayed(Journal(length, truncates), delay, fill=fill)
     issued = np.random.default_rng(seed).uniform(-1, 1, length + 20).astype(np.float32).astype(float).tolist()
     for _ in range(2):
@@ -139,7 +134,7 @@ def test_equals_the_account(delay: Delay, fill: str, length: int, truncates: boo
             assert info["mask"].tolist() == [i < row["age"] for i in range(delay.maximum)]
             if delay.action.maximum:
                 assert info["observation_age"] == row["age"] - delay.action.maximum
-                assert info["applied"] == row["late"]
+                assert info["applied"] == row["applied"]
             assert rewards[t] == row["reward"]
             assert ends[t] == row["end"]
         assert sum(r for r in rewards if r) == 2.0**length - 1  # each reward once, whatever its delay
@@ -148,7 +143,7 @@ def test_equals_the_account(delay: Delay, fill: str, length: int, truncates: boo
 @settings(max_examples=150, deadline=None)
 @given(DELAYS, st.integers(0, 99))
 def test_no_peek_and_no_travel_in_time(delay: Delay, seed: int) -> None:
-    """What is shown is not newer than what had arrived; newest and fifo never go back; the history covers the age."""
+    """Nothing is shown before it arrives; newest and fifo never go back in time; the history covers the age."""
     env = Delayed(Journal(60), Delay(delay.observation, delay.action))
     obs, info = env.reset(seed=seed)
     before = 0.0
@@ -210,14 +205,14 @@ def test_a_longer_history() -> None:
 def vector(mode: str | None, task: str, count: int = 3, **options: Any) -> Any:
     from gymnasium.vector import SyncVectorEnv
 
-    words = {} if mode is None else {"autoreset_mode": mode}
-    return SyncVectorEnv([lambda: gym.make(task, **options) for _ in range(count)], **words)
+    keywords = {} if mode is None else {"autoreset_mode": mode}
+    return SyncVectorEnv([lambda: gym.make(task, **options) for _ in range(count)], **keywords)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize("delay", ["3", "uniform:1:4", "uniform:0:3@fifo+action=uniform:0:2", "paper-stochastic-5"])
 def test_vector_is_many_singles(mode: str, delay: str) -> None:
-    """Number for number, through the ends of episodes, in each of Gymnasium's ways to start the next one."""
+    """Number for number, through the ends of episodes, in each of Gymnasium's autoreset modes."""
     from gymnasium.vector import AutoresetMode
 
     env = AugmentedVectorObservation(DelayedVector(vector(AutoresetMode(mode), "Hopper-v5"), delay))
@@ -273,34 +268,30 @@ def test_vector_streams_and_refusals() -> None:
         AugmentedVectorObservation(vector(None, "Pendulum-v1"))  # type: ignore[arg-type]
 
 
-def test_times_in_seconds() -> None:
-    assert delayrl.make("HalfCheetah-v5", "80ms").delay == as_delay(2)  # 50 ms a step
-    assert delayrl.make("Pendulum-v1", "0.1s+action=60ms").delay == as_delay("2+action=2")
+def test_a_vector_asks_for_the_length_of_a_step() -> None:
     assert DelayedVector(vector(None, "Pendulum-v1"), "0.1s").delay == as_delay(2)
-    with pytest.raises(delayrl.DelayRLError, match="no `dt`"):
-        delayrl.make("delayrl/Walk-v0", "80ms")
 
 
 def test_augmented_state_of_random_actions() -> None:
-    """It tells which action led to what is seen: without that the delayed task would not be Markov."""
+    """It shows which action led to the observation; without that the delayed task would not be Markov."""
     env = AugmentedObservation(Delayed(Journal(30), "1+action=uniform:0:2"))
     env.reset(seed=0)
-    late = set()
+    ages = set()
     for _ in range(29):
         x, *_, info = env.step(env.action_space.sample())
         assert x.shape == (2 + 3 + 2,)
         assert env.observation_space.contains(x.astype(env.observation_space.dtype))
         assert x[-1] == pytest.approx(info["applied"] / 2)
-        late.add(info["applied"])
-    assert late == {0, 1, 2}
+        ages.add(info["applied"])
+    assert ages == {0, 1, 2}
 
 
-class Whole(Journal):
+class Integers(Journal):
     observation_space = gym.spaces.Box(-100, 100, (2,), np.int64)
 
 
-def test_whole_observations_do_not_cut_actions() -> None:
-    env = AugmentedObservation(Delayed(Whole(20), 2))
+def test_integer_observations_do_not_truncate_actions() -> None:
+    env = AugmentedObservation(Delayed(Integers(20), 2))
     env.reset(seed=0)
     for _ in range(3):
         x, *_ = env.step(np.float32([0.75]))
@@ -308,7 +299,7 @@ def test_whole_observations_do_not_cut_actions() -> None:
 
 
 def test_the_time_limit_is_not_late() -> None:
-    """The true end comes at 9, its news would at 15; the time limit of 10 ends the waiting, and pays everything."""
+    """The episode ends at 9 and the agent would learn it at 15. The time limit of 10 ends the waiting and pays all."""
     gym.register("Journal-v0", lambda: Journal(9), max_episode_steps=10)
     env = Delayed(gym.make("Journal-v0", disable_env_checker=True), "1+reward=6")
     gym.registry.pop("Journal-v0")
@@ -322,8 +313,8 @@ def test_the_time_limit_is_not_late() -> None:
     assert sum(rewards) == 2.0**9 - 1
 
 
-def test_an_episode_is_told_of_once() -> None:
-    """The task's own info of its last step is not repeated until the news arrives."""
+def test_the_info_of_the_last_step_is_not_repeated() -> None:
+    """The task's own `info` of the last step comes once, although the termination is still on its way."""
     env = Delayed(gym.wrappers.RecordEpisodeStatistics(Journal(5)), "1+reward=4")
     env.reset(seed=0)
     assert sum("episode" in env.step(np.float32([0]))[4] for _ in range(9)) == 1

@@ -1,4 +1,4 @@
-"""Tasks: any id of Gymnasium's registry, and our own under `delayrl/`; wrapped with a delay."""
+"""Tasks with a delay: any id of Gymnasium's registry, ours under `delayrl/` included."""
 
 import contextlib
 import difflib
@@ -14,7 +14,7 @@ from gymnasium.wrappers import RescaleAction
 
 from delayrl.delays import Channel, Delay, DelayLaw, as_delay
 from delayrl.envs import paper, probe
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.single import seconds_of
 from delayrl.wrappers.transit import Fill
@@ -32,27 +32,27 @@ def make(
     fill: Fill = "first",
     **options: Any,
 ) -> Delayed:
-    """A Gymnasium task with a delay.
+    """Make a Gymnasium task with a delay.
 
     Args:
         env: an id of Gymnasium's registry, e.g. "InvertedPendulum-v5".
         delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; shorter than an episode.
-        rescale: take (and show in `info`) actions in [-1, 1] instead of the task's own range.
+        rescale: whether actions, in `info` too, are in [-1, 1] instead of the task's own range.
         history: rows of the action history, as `Delayed`.
         fill: what is shown before anything has arrived, as `Delayed`.
-        **options: go to `gymnasium.make`, e.g. `render_mode="rgb_array"`.
+        **options: passed to `gymnasium.make`, e.g. `render_mode="rgb_array"`.
 
     Raises:
-        DelayRLError: unknown task (with the nearest names), unsuitable spaces, bad delay.
+        DelayRLError: an unknown task (the message names similar ones), unsuitable spaces, a bad delay.
     """
     try:
         with quiet():
             task = gym.make(env, disable_env_checker=True, **options)
     except Exception as error:  # a task's own constructor may raise anything
         if env in gym.registry:
-            raise DelayRLError(f"task {env!r} cannot be made here: {_first_line(error)}") from error
+            raise DelayRLError(f"task {env!r} cannot be made here: {first_line(error)}") from error
         near = difflib.get_close_matches(env, gym.registry, n=3, cutoff=0.5)
-        hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists the tasks we know"
+        hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists tasks to choose from"
         raise DelayRLError(f"unknown task {env!r}; {hint}") from error
     check_spaces(env, task.observation_space, task.action_space)
     idle = None
@@ -79,9 +79,10 @@ def delay_of(env: str, delay: float | str | DelayLaw | Channel | Delay) -> Delay
 
 
 def physics(env: gym.Env[Any, Any]) -> dict[str, str | None]:
-    """What a return depends on besides the agent: versions of Gymnasium and MuJoCo, and the model's fingerprint.
+    """Return what a result depends on besides the agent: the versions of Gymnasium and MuJoCo, and the physics.
 
-    The last two are None for a task without MuJoCo.
+    Returns:
+        gymnasium, mujoco, physics (the fingerprint of the model); the last two are None for a task without MuJoCo.
     """
     simulated = hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "frame_skip")
     return {
@@ -93,7 +94,7 @@ def physics(env: gym.Env[Any, Any]) -> dict[str, str | None]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Without notes on deprecated models and versions: MuJoCo would print them and start a log file where we run."""
+    """Suppress notes on deprecated models and versions, which MuJoCo would also log to a file in the current folder."""
     import mujoco
 
     mujoco.set_mju_user_warning(lambda message: None)
@@ -118,7 +119,7 @@ class Task:
 
 
 def tasks() -> Iterator[Task]:
-    """The paper's nine tasks, the small ones to try things on, and the probes of the tests."""
+    """List the papers' nine tasks, small ones to try things on, and ours."""
     small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
     ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
     for name in [f"{task}-v5" for task in paper.TASKS] + small + ours:
@@ -128,7 +129,3 @@ def tasks() -> Iterator[Task]:
         high = float(np.max(env.action_space.high))  # type: ignore[attr-defined]
         yield Task(name, spaces[0][0], spaces[1][0], high, limit, seconds_of(env))  # type: ignore[index]
         env.close()
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

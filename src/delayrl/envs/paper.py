@@ -1,8 +1,8 @@
 """The nine MuJoCo tasks of the delayed-RL papers, with the physics that they were published on.
 
-The papers use Gymnasium's `-v4` tasks on MuJoCo 2. On MuJoCo 3 the same ids are other tasks, because the
-library changed underneath. Here Gymnasium's own environments are built, and `MuJoCo2` undoes those changes.
-How far the result agrees with MuJoCo 2.3.7 is in `docs/tasks.md`.
+The papers use Gymnasium's `-v4` tasks on MuJoCo 2. On MuJoCo 3 the same ids are other tasks, because the simulator
+changed. This module makes Gymnasium's own environments, and `MuJoCo2` undoes those changes. `docs/tasks.md` says how
+closely the result agrees with MuJoCo 2.3.7.
 
     delayrl.envs.paper.register()
     env = gymnasium.make("delayrl/Ant-v4")
@@ -31,8 +31,8 @@ TASKS = (
 )
 OLDEST, MARGINS_SUMMED, TOO_NEW = (3, 2, 7), (3, 5, 0), (4, 0, 0)  # MuJoCo versions
 
-# What a fingerprint reads of the model. Positions and orientations are left out: they act through the steps,
-# and the axes of a round body's inertia are arbitrary.
+# The parts of the model that a fingerprint reads. It leaves out positions and orientations, because the axes of a round
+# body's inertia are arbitrary; they show in the simulated steps.
 OPTIONS = """
 timestep gravity density viscosity integrator solver iterations tolerance cone impratio disableflags
 enableflags
@@ -45,10 +45,10 @@ geom_margin geom_gap geom_friction geom_solref geom_solimp actuator_gear actuato
 
 
 def register() -> None:
-    """Add `delayrl/Ant-v4` … `delayrl/Walker2d-v4` to Gymnasium's registry. Harmless again; loads no MuJoCo.
+    """Add `delayrl/Ant-v4` … `delayrl/Walker2d-v4` to Gymnasium's registry. Does not load MuJoCo; may be called again.
 
-    Entry point, time limit and reward threshold are Gymnasium's own. Its `Pusher-v4` refuses MuJoCo 3, so
-    here Pusher is `Pusher-v5` with v4's model file and v4's reward timing.
+    Entry point, time limit and reward threshold are Gymnasium's own. Its `Pusher-v4` refuses MuJoCo 3, so our Pusher is
+    `Pusher-v5` with v4's model file and v4's reward timing.
     """
     for task in TASKS:
         task_id = f"delayrl/{task}-v4"
@@ -69,15 +69,14 @@ def register() -> None:
 
 
 class MuJoCo2(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Gives a Gymnasium MuJoCo environment the physics and the reset observation of MuJoCo 2.3.7.
+    """Give a Gymnasium MuJoCo environment the physics and the reset observation of MuJoCo 2.3.7.
 
-    Undone are, with the MuJoCo version that brought them:
+    The wrapper undoes these changes, listed by the MuJoCo version that introduced them:
 
-    - 3.0: the inverse weight of a body that only slides leaves out its joints' armature (Pusher);
+    - 3.0: the inverse weight of a body that only slides ignores its joints' armature (Pusher);
     - 3.2: `reset` shows the orientation as it was drawn, not as a unit quaternion (Ant, both Humanoids);
-    - 3.3: another algorithm finds the contacts of cylinders (Pusher);
-    - 3.5: a contact's margin is the sum of its geoms' margins, not the larger (Ant, Hopper, both Humanoids,
-      Pusher).
+    - 3.3: another algorithm detects the contacts of cylinders (Pusher);
+    - 3.5: a contact's margin is the sum of its geoms' margins, not the larger (Ant, Hopper, both Humanoids, Pusher).
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]):
@@ -86,9 +85,9 @@ class MuJoCo2(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         restore_physics(self.unwrapped)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset, and show a free joint's orientation as a unit quaternion, as MuJoCo did before 3.2."""
+        """Start an episode. Shows the orientation of free joints as unit quaternions, as MuJoCo did before 3.2."""
         base: Any = self.unwrapped
-        restore_physics(base)  # an environment that was pickled comes back with a newly loaded model
+        restore_physics(base)  # an unpickled environment has loaded its model anew
         observation, info = self.env.reset(seed=seed, options=options)
         free_joints = base.model.jnt_qposadr[base.model.jnt_type == 0]
         for address in free_joints:
@@ -98,14 +97,14 @@ class MuJoCo2(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class RewardBeforeStep(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Pays for the state that the action was taken in, as Pusher-v4 does; v5 pays for the next state."""
+    """Pay for the state in which the action was taken, as Pusher-v4 does. Pusher-v5 pays for the next state."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]):
         RecordConstructorArgs.__init__(self)
         gymnasium.Wrapper.__init__(self, env)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step; the reward and its terms in `info` are those of before the step."""
+        """Step. The reward and its terms in `info` belong to the state before the step."""
         base: Any = self.unwrapped
         reward, terms = base._get_rew(action)
         observation, _, terminated, truncated, info = self.env.step(action)
@@ -113,27 +112,27 @@ class RewardBeforeStep(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorA
 
 
 def restore_physics(base: Any) -> None:
-    """Undo, in the compiled model of a Gymnasium `MujocoEnv`, what MuJoCo 3 means otherwise; once per model.
+    """Undo what MuJoCo 3 changed in the compiled model of a Gymnasium `MujocoEnv`. Does nothing the second time.
 
     Args:
         base: the unwrapped environment; its `model` is changed in place.
 
     Raises:
-        DelayRLError: the installed MuJoCo is outside the range for which the changes are known.
+        DelayRLError: a MuJoCo version whose changes are not known.
     """
     if getattr(base, "restored_model", None) is base.model:
         return
     import mujoco
 
     version, model = _supported_version(mujoco.__version__), base.model
-    for flag in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # where they can be disabled, they are on
+    for flag in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # versions without these flags lack the algorithms too
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, flag, 0))
     if version >= MARGINS_SUMMED:
-        # In each task all geoms that can touch have one margin, so that halves sum to what was the larger.
+        # In each task all geoms that can touch have the same margin, so two halves add up to the larger one.
         model.geom_margin[:] *= 0.5
     for body in np.flatnonzero(model.body_simple == 2):  # 2: all its joints are slides
-        # MuJoCo 3 takes 1 / mass. Pusher's object has hardly any: its contacts went limp and the arm passes
-        # through it (https://github.com/Farama-Foundation/Gymnasium/issues/950).
+        # MuJoCo 3 uses 1 / mass. Pusher's object has hardly any mass, so that the arm passes through it
+        # (https://github.com/Farama-Foundation/Gymnasium/issues/950).
         dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
         model.dof_invweight0[dofs] = 1.0 / (model.dof_armature[dofs] + model.body_mass[body])
         model.body_invweight0[body] = model.dof_invweight0[dofs].sum() / 3.0, 0.0  # translation, rotation
@@ -141,19 +140,19 @@ def restore_physics(base: Any) -> None:
 
 
 def fingerprint(env: gymnasium.Env[Any, Any]) -> str:
-    """A short name for the physics of an environment: 16 hexadecimal digits.
+    """Hash the physics of an environment to 16 hexadecimal digits.
 
-    It is made of the sizes, the model's constants (to 6 digits), and where 20 steps with fixed pseudo-random
-    controls lead from the model's initial state (to 1e-5). Rewards, terminations and wrappers do not enter.
-    One physics may read differently in two MuJoCo versions, so compare within one version. `env` is left as
-    it is: the steps run on a simulation of their own.
+    The hash covers the sizes, the model's constants (to 6 digits), and the state that 20 steps with fixed pseudo-random
+    controls lead to from the model's initial state (to 1e-5). It ignores rewards, terminations and wrappers. The same
+    physics may have other hashes under other MuJoCo versions, so compare within one version. The steps run in a
+    simulation of their own and do not change `env`.
 
     Raises:
         DelayRLError: `env` is not a Gymnasium MuJoCo environment.
     """
     base: Any = env.unwrapped
     if not hasattr(base, "model") or not hasattr(base, "frame_skip"):
-        raise DelayRLError(f"fingerprint: give it a Gymnasium MuJoCo environment, not {type(base).__name__}")
+        raise DelayRLError(f"a fingerprint needs a Gymnasium MuJoCo environment, not {type(base).__name__}")
     import mujoco
 
     model = base.model
@@ -170,7 +169,7 @@ def fingerprint(env: gymnasium.Env[Any, Any]) -> str:
     for _ in range(20):
         data.ctrl[:] = rng.uniform(low, high)
         mujoco.mj_step(model, data, nstep=base.frame_skip)
-    state = np.round(np.concatenate([data.qpos, data.qvel]), 5) + 0.0  # + 0.0 makes -0.0 and 0.0 one
+    state = np.round(np.concatenate([data.qpos, data.qvel]), 5) + 0.0  # + 0.0 turns -0.0 into 0.0
     digest.update(repr(state.tolist()).encode())
     return digest.hexdigest()[:16]
 

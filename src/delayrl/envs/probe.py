@@ -1,4 +1,4 @@
-"""Small tasks, each of which isolates one way to be silently wrong; for tests and for trying an agent in seconds."""
+"""Small tasks for tests and quick trials of an agent. Each one exposes one kind of silent error."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _STEP = tuple[Obs, float, bool, bool, dict[str, Any]]
 
 
 class Coin(gym.Env[Obs, Obs]):
-    """The state is a fresh fair coin ±1 at every step, the reward a·s: under delay nobody averages above 0."""
+    """The state is a new fair coin s = ±1 at every step, the reward a·s. With a delay no agent averages above 0."""
 
     observation_space = Box(-1, 1, (1,), np.float32)
     action_space = Box(-1, 1, (1,), np.float32)
@@ -23,7 +23,7 @@ class Coin(gym.Env[Obs, Obs]):
         return self._toss(), {}
 
     def step(self, action: Obs) -> _STEP:
-        """Pay for having guessed the coin that lies on the table, then toss the next."""
+        """Pay for guessing the coin on the table, then toss the next."""
         reward = float(action[0] * self._coin[0])
         return self._toss(), reward, False, False, {}
 
@@ -33,7 +33,7 @@ class Coin(gym.Env[Obs, Obs]):
 
 
 class Walk(gym.Env[Obs, Obs]):
-    """s' = s + a, reward -s²: with a delay it is solved only by remembering the actions on their way."""
+    """s' = s + a, reward -s². With a delay only an agent that knows the actions on their way solves it."""
 
     observation_space = Box(-10, 10, (1,), np.float32)
     action_space = Box(-1, 1, (1,), np.float32)
@@ -45,19 +45,19 @@ class Walk(gym.Env[Obs, Obs]):
         return self._position, {}
 
     def step(self, action: Obs) -> _STEP:
-        """Move by the action; pay the square of where that leads."""
+        """Move by the action, and pay for the new position."""
         self._position = np.clip(self._position + np.clip(action, -1, 1), -10, 10).astype(np.float32)
         return self._position, -float(self._position[0] ** 2), False, False, {}
 
 
 class Counter(gym.Env[Obs, Obs]):
-    """Counts: observation [t, T], reward t + 1, terminates after T steps, T drawn from 4..10 (alignment shows)."""
+    """Observation [t, T], reward t + 1, termination after T steps, T drawn from 4..10. It shows misaligned steps."""
 
     observation_space = Box(0, 10, (2,), np.float32)
     action_space = Box(-1, 1, (1,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Draw the length, and start at 0."""
+        """Draw the length of the episode, and start at 0."""
         super().reset(seed=seed)
         self._length = int(self.np_random.integers(4, 11))
         self._time = 0
@@ -73,7 +73,7 @@ class Counter(gym.Env[Obs, Obs]):
 
 
 def register() -> None:
-    """Enter the probes in Gymnasium's registry (again and again does no harm)."""
+    """Add the probes to Gymnasium's registry. May be called again."""
     for name, entry, limit in (("Coin", Coin, 50), ("Walk", Walk, 50), ("Counter", Counter, 1000)):
         if f"delayrl/{name}-v0" not in gym.registry:
             gym.register(f"delayrl/{name}-v0", entry_point=entry, max_episode_steps=limit)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Gymnasium wrappers that make observations, actions and rewards arrive late. They need NumPy and Gymnasium alone."""
+"""Gymnasium wrappers that delay observations, actions and rewards. They need NumPy and Gymnasium alone."""
 
 from delayrl.wrappers.augmented import AugmentedObservation, AugmentedVectorObservation
 from delayrl.wrappers.single import Delayed, check_spaces

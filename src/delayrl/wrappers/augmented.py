@@ -1,8 +1,9 @@
 """The augmented state as one vector, so that any library can train on a delayed task.
 
-The vector is the shown observation, the actions of the history (oldest first, zeros where there are none yet) and the
-age divided by the history's length H: size S + H·A + 1. Where actions are late by a random time one number is added:
-how old the action was that led to the observation, divided by the longest delay. Without a delay nothing changes.
+The vector has the size S + H·A + 1. It holds the shown observation, the actions of the history (oldest first, zeros
+where there are none yet) and the age divided by the history's length H. A random delay of the actions adds one number:
+the age of the action that led to the observation, divided by the longest delay. Without a delay the observation stays
+as it is.
 """
 
 from typing import Any, SupportsFloat
@@ -21,7 +22,7 @@ from delayrl.wrappers.single import Delayed, Info
 from delayrl.wrappers.vector import DelayedVector
 
 
-def _space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, delay: Delay) -> Box:
+def _augmented_space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, delay: Delay) -> Box:
     assert isinstance(observations, Box)
     assert isinstance(actions, Box)
     if not history:
@@ -29,7 +30,7 @@ def _space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, 
     # a slot without an action holds zeros, which the action's own bounds need not contain
     low, high = np.minimum(actions.low, 0), np.maximum(actions.high, 0)
     numbers = 1 if delay.action.constant else 2
-    # whole numbers, as observations may be, would cut actions and age
+    # integer observations become float, because integers would truncate actions and age
     dtype = np.promote_types(observations.dtype, np.float32)  # type: ignore[arg-type]
     return Box(
         np.concatenate([observations.low, np.tile(low, history), np.zeros(numbers)]).astype(dtype),
@@ -39,7 +40,7 @@ def _space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, 
 
 
 def _augment(obs: NDArray[Any], info: Info, history: int, delay: Delay, dtype: Any) -> NDArray[Any]:
-    """For one environment, or with a leading axis for many."""
+    """Join observation, actions and ages to vectors, with or without a leading axis for environments."""
     if not history:
         return obs
     size, actions = obs.shape[-1], info["actions"]
@@ -54,7 +55,7 @@ def _augment(obs: NDArray[Any], info: Info, history: int, delay: Delay, dtype: A
 
 
 class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
-    """Shows the augmented state as one vector.
+    """Show the augmented state as one vector.
 
     Args:
         env: an environment wrapped by `Delayed`.
@@ -62,11 +63,11 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
 
     def __init__(self, env: Delayed) -> None:
         if not isinstance(env, Delayed):
-            raise DelayRLError("AugmentedObservation goes around Delayed: wrap the task with a delay first")
+            raise DelayRLError("AugmentedObservation goes around Delayed: wrap the task in Delayed first")
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self._history, self._delay = env.history, env.delay
-        self.observation_space = _space(env.observation_space, env.action_space, env.history, env.delay)
+        self.observation_space = _augmented_space(env.observation_space, env.action_space, env.history, env.delay)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start an episode."""
@@ -74,7 +75,7 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
         return self._augment(obs, info), info
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
-        """Act now; see the augmented state of the next step."""
+        """Issue an action. Returns the augmented state of the next step."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._augment(obs, info), reward, terminated, truncated, info
 
@@ -83,7 +84,7 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
 
 
 class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
-    """Shows the augmented states of a vector of environments, [N, S + H·A + 1].
+    """Show the augmented states of a vector of environments, [N, S + H·A + 1].
 
     Args:
         env: a vector of environments wrapped by `DelayedVector`.
@@ -91,12 +92,10 @@ class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def __init__(self, env: DelayedVector) -> None:
         if not isinstance(env, DelayedVector):
-            raise DelayRLError(
-                "AugmentedVectorObservation goes around DelayedVector: wrap the tasks with a delay first"
-            )
+            raise DelayRLError("AugmentedVectorObservation goes around DelayedVector: wrap the tasks in it first")
         super().__init__(env)
         self._history, self._delay = env.history, env.delay
-        single = _space(env.single_observation_space, env.single_action_space, env.history, env.delay)
+        single = _augmented_space(env.single_observation_space, env.single_action_space, env.history, env.delay)
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
 
@@ -106,7 +105,7 @@ class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         return self._augment(obs, infos), infos
 
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Info]:
-        """Act in all of them."""
+        """Issue an action in every environment."""
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         for i in np.flatnonzero(infos.get("_final_obs", [])):
             last = {name: infos["final_info"][name][i] for name in infos["final_info"] if not name.startswith("_")}
@@ -114,5 +113,4 @@ class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         return self._augment(obs, infos), rewards, terminated, truncated, infos
 
     def _augment(self, obs: NDArray[Any], info: Info) -> NDArray[Any]:
-        dtype = self.single_observation_space.dtype
-        return _augment(obs, info, self._history, self._delay, dtype)
+        return _augment(obs, info, self._history, self._delay, self.single_observation_space.dtype)

@@ -1,7 +1,6 @@
-"""The wrapper of one environment."""
+"""The wrapper that delays one environment."""
 
-from collections.abc import Iterator
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +17,11 @@ Info = dict[str, Any]
 
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
-    """Say in one line what is wrong with a task that has no flat observations or no bounded continuous actions."""
+    """Refuse a task unless its observations are flat and its actions are continuous and bounded.
+
+    Raises:
+        DelayRLError: what is wrong, in one line that starts with `name`.
+    """
     if not isinstance(observations, Box):
         raise DelayRLError(f"{name}: observations must be a Box; got {observations}. Flatten them first")
     if len(observations.shape) != 1:
@@ -34,81 +37,80 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
 
 
 def name_of(env: Any) -> str:
-    """The id of an environment, or its class."""
+    """Return the id of an environment, or the name of its class if it has none."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
-def _layers(env: Any) -> Iterator[Any]:
-    """An environment and what it wraps."""
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = env.env
-
-
 def seconds_of(env: Any) -> float | None:
-    """How long a step of the task is, where it says so: its `dt`, or `tau`."""
-    for seconds in (getattr(env.unwrapped, name, None) for name in ("dt", "tau")):
+    """Return the length of a step in seconds, which a task gives as `dt` or `tau`; None if it does not."""
+    for name in ("dt", "tau"):
+        seconds = getattr(env.unwrapped, name, None)
         if isinstance(seconds, int | float | np.number) and seconds > 0:
             return float(seconds)
     return None
 
 
-def check_length(env: Any, delay: Delay, history: int | None, fill: str) -> int:
-    """The rows of the action history. Raises DelayRLError where delay, history and episode do not fit together."""
+def history_rows(env: Any, delay: Delay, history: int | None) -> int:
+    """Return the rows of the action history: `history`, or the longest age where it is None.
+
+    Raises:
+        DelayRLError: the delay is as long as an episode, or the history is shorter than the longest age.
+    """
     limit = env.spec.max_episode_steps if env.spec is not None else None
     longest = max(delay.maximum, delay.reward.maximum)
     if limit is not None and longest >= limit:
         raise DelayRLError(
             f"a delay of {longest} steps is no shorter than an episode of {name_of(env)} ({limit} steps)"
         )
-    if fill not in ("first", "zeros"):
-        raise DelayRLError(f"fill must be first or zeros; got {fill!r}")
-    if history is not None and whole_steps(history) < delay.maximum:
+    if history is None:
+        return delay.maximum
+    if whole_steps(history) < delay.maximum:
         raise DelayRLError(f"a history of {history} actions is too short for ages up to {delay.maximum}")
-    return delay.maximum if history is None else history
+    return history
 
 
-def masks(history: int) -> NDArray[np.bool_]:
-    """Row i is true for its first i slots: [history + 1, history]."""
+def age_masks(history: int) -> NDArray[np.bool_]:
+    """Return the mask of each age as a row: row i is true in its first i slots, [history + 1, history]."""
     return np.arange(history) < np.arange(history + 1)[:, None]  # type: ignore[no-any-return]
 
 
-def transit_of(delay: Delay, history: int, fill: Fill, actions: Box, idle: Any = None) -> Transit:
-    """The delayed side of an environment with these actions."""
+def make_transit(delay: Delay, history: int, fill: Fill, actions: Box, idle: Any = None) -> Transit:
+    """Make the delayed side of an environment with these actions. Raises DelayRLError for a bad fill or idle action."""
+    if fill not in get_args(Fill):
+        raise DelayRLError(f"fill must be {' or '.join(get_args(Fill))}; got {fill!r}")
     idle = np.zeros(actions.shape) if idle is None else np.asarray(idle)
     if idle.shape != actions.shape:
         raise DelayRLError(f"the idle action must have the shape {actions.shape}; got {idle.shape}")
-    idle = np.clip(idle.astype(actions.dtype), actions.low, actions.high)
-    return Transit(delay, history, fill, actions.shape[0], actions.dtype, idle)
+    return Transit(delay, history, fill, np.clip(idle.astype(actions.dtype), actions.low, actions.high))
 
 
 class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
-    """Makes observations late; and actions and rewards, where the delay says so.
+    """Delay the observations of an environment, and its actions and rewards if the delay says so.
 
     Added to `info`, with H the history's length (the longest age), A the size of an action and S of an observation:
       age      (int)           how many actions may not have acted yet on the state that is shown: the steps since it
-                               was made, and the longest delay of the actions
+                               was made, plus the longest delay of the actions
       actions  (float [H, A])  these actions as they were issued, oldest first, zeros after the first `age`
       mask     (bool [H])      true for the first `age` slots
       truth    (float [S])     the true current observation: for privileged learners and tests, never for the agent
-    and where actions are late:
+    and with delayed actions:
       observation_age (int)    the steps since the shown observation was made
-      applied  (int)           how old the action was that led to the shown observation: 0 if it acted at once
+      applied  (int)           the age of the action that led to the shown observation: 0 if it acted at once
 
-    What else is in `info` is the task's own and is not late; so wrappers that speak of episodes belong around this one.
-    Before its first action arrives, zero acts (clipped to the bounds). A late termination leaves the agent acting, to
-    no effect, on an episode that is over; the time limit is not late, and with it comes all that was on its way.
+    The task's own `info` has no delay, so put wrappers that record episodes around this one. Before the first action
+    arrives, the idle action acts. While a termination is on its way, the agent's actions have no effect. A time limit
+    has no delay, and all that is on its way arrives with it.
 
     Args:
         env: any Gymnasium environment with flat Box observations and actions.
         delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`: see `delayrl.delays`.
         history: rows of the action history, to train for longer ages than this delay has; None for the longest age.
         fill: what is shown before anything has arrived: "first" (s_0, at once) or "zeros".
-        idle: the action in force before the first one has arrived, [A]; None for zero.
-        step_seconds: the length of a step, for delays given as times; None for what the task says (`dt`).
+        idle: the action in force before the first one has arrived, [A]; None for zero. Clipped to the bounds.
+        step_seconds: the length of a step, for delays given as times; None for what the task says (`dt` or `tau`).
 
     Raises:
-        DelayRLError: for a bad delay, or an environment whose spaces are not flat boxes.
+        DelayRLError: a bad delay, or an environment whose spaces are not flat boxes.
     """
 
     def __init__(
@@ -120,50 +122,57 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
-        if any(isinstance(inner, Delayed) for inner in _layers(env)):
-            raise DelayRLError("the environment is delayed already: give one delay, as in Delayed(task, '2+action=1')")
+        inner: Any = env
+        while isinstance(inner, gym.Wrapper):
+            if isinstance(inner, Delayed):
+                raise DelayRLError(
+                    "the environment is delayed already: give one delay, as in Delayed(task, '2+action=1')"
+                )
+            inner = inner.env
         check_spaces(name_of(env), env.observation_space, env.action_space)
+        assert isinstance(env.action_space, Box)
         self.delay = as_delay(delay, seconds_of(env) if step_seconds is None else step_seconds)
         RecordConstructorArgs.__init__(self, delay=self.delay.plain(), history=history, fill=fill, idle=idle)
         gym.Wrapper.__init__(self, env)
-        self.history = check_length(env, self.delay, history, fill)
-        assert isinstance(env.action_space, Box)
-        self._transit = transit_of(self.delay, self.history, fill, env.action_space, idle)
+        self.history = history_rows(env, self.delay, history)
+        self._transit = make_transit(self.delay, self.history, fill, env.action_space, idle)
         self._limit = env.spec.max_episode_steps if env.spec is not None else None
-        self._masks, self._dtype = masks(self.history), env.action_space.dtype
-        self._last: NDArray[Any] = np.zeros(0)
+        self._masks, self._dtype = age_masks(self.history), env.action_space.dtype
+        self._truth: NDArray[Any] = np.zeros(0)
         self._info: Info = {}
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
-        """Start an episode."""
-        self._last, self._info = self.env.reset(seed=seed, options=options)
-        self._transit.reset(self._last, seed)
+        """Start an episode. The seed fixes its delays too."""
+        self._truth, self._info = self.env.reset(seed=seed, options=options)
+        self._transit.reset(self._truth, seed)
         return self._show()
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
-        """Act; see what has arrived by the next step."""
+        """Issue an action. Returns what has arrived by the next step."""
         applied = self._transit.act(np.asarray(action, self._dtype))
-        reward, terminated, truncated = 0.0, False, False
+        reward: Any = 0.0
+        terminated = truncated = False
         if self._transit.over:
-            truncated, self._info = self._limit is not None and self._transit.time + 1 >= self._limit, {}
+            truncated = self._limit is not None and self._transit.time + 1 >= self._limit
+            self._info = {}
         else:
-            self._last, reward, terminated, truncated, self._info = self.env.step(applied)  # type: ignore[assignment]
-        reward, terminated, truncated = self._transit.step(self._last, reward, terminated, truncated)
+            self._truth, reward, terminated, truncated, self._info = self.env.step(applied)
+        reward, terminated, truncated = self._transit.step(self._truth, reward, terminated, truncated)
         obs, info = self._show()
         return obs, reward, terminated, truncated, info
 
     def draw_from(self, seed: int) -> None:
-        """Draw the travel times of the episode that has just been reset from another seed than the task's."""
+        """Take the delays of the current episode from another seed than the task's. Call it right after `reset`."""
         self._transit.random = np.random.default_rng([seed, 1])
 
     def _show(self) -> tuple[NDArray[Any], Info]:
-        obs, age, recent, late = self._transit.shown()
+        obs, age, recent, applied = self._transit.shown()
         if age == self.history:
             actions = recent.copy()
         else:
             actions = np.zeros((self.history, recent.shape[1]), recent.dtype)
             actions[:age] = recent
-        info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy(), "truth": self._last}
+        info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy(), "truth": self._truth}
         if self.delay.action.maximum:
-            info["observation_age"], info["applied"] = age - self.delay.action.maximum, late
+            info["observation_age"], info["applied"] = age - self.delay.action.maximum, applied
         return obs.copy(), info

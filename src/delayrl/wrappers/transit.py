@@ -1,8 +1,8 @@
 """One episode under a delay: what is on its way, what has arrived, and what is shown. It knows no environment.
 
-At step t the agent has seen s_0 .. s_t as far as they have arrived, and issued u_0 .. u_{t-1}. What is shown makes the
-delayed task Markov again where that is possible (docs/delays.md says where not): the observation, its age, and the
-actions that may not have acted yet when it was made.
+At step t the agent has issued u_0 .. u_{t-1} and has seen those of s_0 .. s_t that have arrived. It is shown an
+observation, its age, and the actions that may not have acted when it was made. This makes the delayed task Markov again
+where that is possible; docs/delays.md says where it is not.
 """
 
 from typing import Any, Literal
@@ -13,55 +13,53 @@ from numpy.typing import NDArray
 from delayrl.delays import Channel, Delay
 
 Fill = Literal["first", "zeros"]
-"""What is shown before anything has arrived: s_0, which then has no delay, or zeros."""
+"""What is shown before anything has arrived: s_0 without a delay, or zeros."""
 
 
-class Line:
-    """Messages 0, 1, … on one channel; of those that have arrived, which counts. -1 before any has."""
+class MessageQueue:
+    """Messages 0, 1, … on one channel, and which of those that have arrived counts; -1 before any has."""
 
     def __init__(self, channel: Channel):
-        self._law, self._raw, self._fifo = channel.law, channel.rule == "raw", channel.rule == "fifo"
-        self._slots = channel.maximum + 1
-        self._constant = channel.maximum if channel.constant else None  # the short way, for what is most common
+        self._law, self._constant, self._maximum = channel.law, channel.constant, channel.maximum
+        self._raw, self._fifo, self._slots = channel.rule == "raw", channel.rule == "fifo", channel.maximum + 1
         self.start()
 
     def start(self, newest: int = -1) -> None:
-        """Nothing is on its way; message `newest` is there."""
-        self._due = [-1] * self._slots  # by arrival time, modulo: older entries are overtaken, so none is cleared
-        self._newest, self._memory, self._latest = newest, 0, 0
+        """Empty the queue; message `newest` has arrived."""
+        # by arrival time, modulo; older entries have lower numbers than what has arrived, so they need not be cleared
+        self._due = [-1] * self._slots
+        self._newest, self._law_state, self._latest = newest, 0, 0
 
     def send(self, number: int, random: np.random.Generator) -> int:
-        """Send message `number`, at time `number`; which counts now. Numbers go up by one."""
-        if self._constant is not None:
-            return max(number - self._constant, self._newest)
-        travel, self._memory = self._law.draw(self._memory, random)
+        """Send message `number` at time `number`. Returns the message that counts now."""
+        if self._constant:  # a shortcut for the most common law
+            return max(number - self._maximum, self._newest)
+        travel, self._law_state = self._law.draw(self._law_state, random)
         if self._raw:
             return max(number - travel, -1)
         arrival = number + travel
         if self._fifo:
             self._latest = arrival = max(arrival, self._latest)
         self._due[arrival % self._slots] = number
-        newest = self._due[number % self._slots]
-        if newest > self._newest:
-            self._newest = newest
+        self._newest = max(self._newest, self._due[number % self._slots])
         return self._newest
 
 
-class Rewards:
-    """Rewards on their way: each arrives once; `flush` gives what is left."""
+class RewardQueue:
+    """Rewards on their way. Each arrives once."""
 
     def __init__(self, channel: Channel):
         self._law, self._fifo, self._slots = channel.law, channel.rule == "fifo", channel.maximum + 1
         self.start()
 
     def start(self) -> None:
-        """Nothing is on its way."""
+        """Empty the queue."""
         self._due = [0.0] * self._slots
-        self._memory = self._latest = 0
+        self._law_state = self._latest = 0
 
     def send(self, reward: float, now: int, random: np.random.Generator) -> int:
-        """Send what was earned by the step that ended at `now`; when it arrives."""
-        travel, self._memory = self._law.draw(self._memory, random)
+        """Send the reward of the step that ended at `now`. Returns when it arrives."""
+        travel, self._law_state = self._law.draw(self._law_state, random)
         arrival = now + travel
         if self._fifo:
             self._latest = arrival = max(arrival, self._latest)
@@ -69,12 +67,13 @@ class Rewards:
         return arrival
 
     def receive(self, now: int) -> float:
-        """The sum of what arrives at `now`."""
-        reward, self._due[now % self._slots] = self._due[now % self._slots], 0.0
+        """Remove what arrives at `now` from the queue, and return its sum."""
+        slot = now % self._slots
+        reward, self._due[slot] = self._due[slot], 0.0
         return reward
 
     def flush(self) -> float:
-        """The sum of all that is still on its way."""
+        """Remove all that is still on its way, and return its sum."""
         total = sum(self._due)
         self._due = [0.0] * self._slots
         return total
@@ -85,95 +84,112 @@ class Transit:
 
     Attributes:
         time: steps since the start of the episode.
-        over: the episode has ended in truth, and the agent has not been told yet: nothing acts any more.
-        random: where travel times are drawn from.
+        over: whether the episode has ended, but the agent has not been told yet. Actions then have no effect.
+        random: the generator of travel times.
 
     Args:
-        delay: of observations, actions and rewards.
-        history: rows of the shown action buffer, at least `delay.maximum`.
+        delay: the delay of observations, actions and rewards.
+        history: rows of the shown action history, at least `delay.maximum`.
         fill: what is shown before the first observation has arrived.
-        size: of an action (A).
-        dtype: of actions.
-        idle: the action in force before the first one has arrived, [A].
+        idle: the action in force before the first one has arrived, [A], in the type of all actions.
     """
 
-    def __init__(self, delay: Delay, history: int, fill: Fill, size: int, dtype: Any, idle: NDArray[Any]):
+    def __init__(self, delay: Delay, history: int, fill: Fill, idle: NDArray[Any]):
         self._fill, self._idle = fill, idle
-        self._lines, self._rewards = Line(delay.observation), Rewards(delay.reward)
-        self._acting = Line(delay.action) if delay.action.maximum else None
-        self._late_rewards = delay.reward.maximum > 0
-        self._lag = delay.action.maximum
-        self._slots = delay.observation.maximum + 1
+        self._observations, self._rewards = MessageQueue(delay.observation), RewardQueue(delay.reward)
+        self._actions = MessageQueue(delay.action)
+        self._max_action_delay, self._max_reward_delay = delay.action.maximum, delay.reward.maximum
         # each action lies twice in a ring of double length, so that any stretch of it is one slice
         self._rows = max(history, 1)
-        self._ring = np.zeros((2 * self._rows, size), dtype)
-        self._lateness = 0  # of the action that acts now, in steps
-        self._states: list[Any] = [None] * self._slots
-        self._applied = [0] * self._slots  # by step: steps since the action was issued that led to this state
+        self._ring = np.zeros((2 * self._rows, len(idle)), idle.dtype)
+        self._action_age = 0  # of the action that acts now: steps since it was issued
+        # by step, modulo: the true observations, and the age of the action that led to each
+        self._slots = delay.observation.maximum + 1
+        self._truths: list[Any] = [None] * self._slots
+        self._applied = [0] * self._slots
+        self._shown = 0
+        self._end: int | None = None  # once the episode is over: when the agent is told
+        self.time, self.over = 0, False
         self.random = np.random.default_rng()
 
     def reset(self, truth: NDArray[Any], seed: int | None = None) -> None:
-        """Start an episode with the true s_0.
+        """Start an episode.
 
-        A seed fixes the delays: a stream of their own, so that they do not disturb the environment's randomness.
+        Args:
+            truth: the true first observation, [S].
+            seed: fixes the delays of this episode and of those after it; None to go on with the same random numbers.
+                Delays have a stream of their own, so they do not disturb the environment's randomness.
         """
         if seed is not None:
             self.random = np.random.default_rng([seed, 1])
-        self.time = 0
-        self._end: int | None = None  # when the agent is told that the episode is over, once it is
-        self.over = False
+        self.time, self._end, self.over = 0, None, False
         self._ring[:] = self._idle
         self._rewards.start()
-        if self._acting:
-            self._acting.start()
-        self._states[0], self._applied[0] = np.array(truth), 0
+        self._actions.start()
+        self._truths[0], self._applied[0] = np.array(truth), 0
         if self._fill == "first":
-            self._lines.start(0)
+            self._observations.start(0)
             self._shown = 0
         else:
-            self._lines.start()
-            self._shown = self._lines.send(0, self.random)
+            self._observations.start()
+            self._shown = self._observations.send(0, self.random)
 
     def act(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Issue an action; the one that acts now, which is the same array if nothing is late."""
+        """Issue an action. Returns the one that acts now: the same array if it has no delay."""
         applied, now, rows = action, self.time, self._rows
-        if self._acting:
-            self._lateness = min(now - self._acting.send(now, self.random), self._lag)
-            if self._lateness:  # before the first has arrived, the idle action that the ring was filled with
-                applied = self._ring[(now - self._lateness) % rows].copy()
+        if self._max_action_delay:
+            self._action_age = min(now - self._actions.send(now, self.random), self._max_action_delay)
+            if self._action_age:  # the ring holds the idle action where none has been issued
+                applied = self._ring[(now - self._action_age) % rows].copy()
         row = now % rows
         self._ring[row] = self._ring[row + rows] = action
         return applied
 
     def step(self, truth: NDArray[Any], reward: float, terminated: bool, truncated: bool) -> tuple[float, bool, bool]:
-        """Take in the outcome of a step, or after the end (`over`) the last state again and 0; what arrives of it."""
+        """Take in the outcome of a step.
+
+        Args:
+            truth: the true observation; once the episode is `over`, the last one again.
+            reward: what the step earned.
+            terminated: whether the episode has ended.
+            truncated: whether a time limit cuts it off.
+
+        Returns:
+            The reward, termination and truncation that arrive now.
+        """
         self.time += 1
         slot = self.time % self._slots
-        self._states[slot], self._applied[slot] = np.array(truth), self._lateness
-        shown = self._lines.send(self.time, self.random)
-        self._shown = shown if shown >= 0 or self._fill == "zeros" else 0
-        if self._late_rewards:
-            if self._end is None:
-                arrival = self._rewards.send(float(reward), self.time, self.random)
-                self._end, self.over = (arrival, True) if terminated else (None, False)
-            reward = self._rewards.receive(self.time)
-            # a time limit is the learner's own: it ends the waiting
-            terminated = self._end is not None and (truncated or self._end == self.time)
-            if terminated or truncated:
-                reward += self._rewards.flush()
+        self._truths[slot], self._applied[slot] = np.array(truth), self._action_age
+        self._shown = self._observations.send(self.time, self.random)
+        if self._shown < 0 and self._fill == "first":
+            self._shown = 0
+        if not self._max_reward_delay:
+            return reward, terminated, truncated
+        if not self.over:
+            arrival = self._rewards.send(float(reward), self.time, self.random)
+            if terminated:
+                self._end, self.over = arrival, True
+        reward = self._rewards.receive(self.time)
+        # the learner knows of a time limit at once, so it ends the waiting
+        terminated = self.over and (truncated or self._end == self.time)
+        if terminated or truncated:
+            reward += self._rewards.flush()
         return reward, terminated, truncated
 
     def shown(self) -> tuple[NDArray[Any], int, NDArray[Any], int]:
-        """What is seen now: views of what is kept here, to be copied before the next step.
+        """Return what the agent sees now, as views: copy them before the next step.
 
         Returns:
-            The observation; `age`; the `age` newest actions that were issued, oldest first; and how old the action was
-            that led to the observation, whose own age is `age` less the longest action delay.
+            obs: the observation, [S].
+            age: how many actions may not have acted on it: its own age plus the longest delay of the actions.
+            actions: these actions as they were issued, oldest first, [age, A].
+            applied: the age of the action that led to the observation.
         """
-        now, shown = self.time, self._shown
-        age = (now - shown if shown >= 0 else now) + self._lag
-        first = (now - age) % self._rows
-        actions, slot = self._ring[first : first + age], shown % self._slots
-        if shown < 0:
-            return np.zeros_like(self._states[0]), age, actions, 0
-        return self._states[slot], age, actions, self._applied[slot]
+        nothing_arrived = self._shown < 0
+        made = 0 if nothing_arrived else self._shown
+        age = self.time - made + self._max_action_delay
+        first, slot = (self.time - age) % self._rows, made % self._slots
+        actions = self._ring[first : first + age]
+        if nothing_arrived:
+            return np.zeros_like(self._truths[0]), age, actions, 0
+        return self._truths[slot], age, actions, self._applied[slot]

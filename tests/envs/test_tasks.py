@@ -1,0 +1,48 @@
+"""Tasks by id, delays in their steps, and errors that name the nearest task."""
+
+from typing import Any
+
+import pytest
+
+import delayrl
+from delayrl import envs
+from delayrl.delays import as_delay
+
+
+def test_times_in_seconds() -> None:
+    assert delayrl.make("HalfCheetah-v5", "80ms").delay == as_delay(2)  # 50 ms a step
+    assert delayrl.make("Pendulum-v1", "0.1s+action=60ms").delay == as_delay("2+action=2")
+    with pytest.raises(delayrl.DelayRLError, match="no `dt`"):
+        delayrl.make("delayrl/Walk-v0", "80ms")
+
+
+def test_a_task_is_made_only_for_the_length_of_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    def make(name: str, **options: Any) -> Any:
+        made.append(name)
+        return gym_make(name, **options)
+
+    gym_make = envs.gym.make
+    monkeypatch.setattr(envs.gym, "make", make)
+    for delay in (5, "uniform:1:5", as_delay("walk:3"), "recorded:1,2,"):
+        assert envs.delay_of("Pendulum-v1", delay) == as_delay(delay)
+    assert not made
+    assert envs.delay_of("Pendulum-v1", "uniform:60ms:0.1s+action=40ms") == as_delay("uniform:2:2+action=1")
+    assert made == ["Pendulum-v1"]
+    with pytest.raises(delayrl.DelayRLError, match="did you mean Pendulum-v1"):
+        envs.delay_of("Pendulm-v1", "80ms")
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ("CartPole-v1", "continuous"),
+        ("FrozenLake-v1", "must be a Box"),
+        ("Invertedpendulum-v5", "did you mean InvertedPendulum-v5"),
+        ("nonsense", "delayrl tasks"),
+    ],
+)
+def test_bad_tasks(task: str, words: str) -> None:
+    with pytest.raises(delayrl.DelayRLError, match=words):
+        delayrl.make(task, 1)
