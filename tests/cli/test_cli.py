@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from delayrl.agents.registry import AGENTS
-from delayrl.cli.main import main
+from delayrl.cli.main import COMMANDS, main
 from delayrl.run.configuration import options
 from delayrl.run.folder import Run
 
@@ -71,6 +71,21 @@ def test_watch(run: Path, kind: str, tmp_path: Path, capsys: pytest.CaptureFixtu
         assert "Traceback" not in done.stderr
 
 
+def test_help_needs_no_jax() -> None:
+    program = (
+        "import sys; from delayrl.cli.main import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    assert f"delayrl {command}" in capsys.readouterr().out
+
+
 def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
     main(["agents"])
     out = capsys.readouterr().out
@@ -106,11 +121,12 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train vdpo --env Reacher-v5", "at least 1 step"),
         ("train sac --env Reacher-v5 --delay 3", "delay-free reference"),
         ("train vdpo --env CartPole-v1 --delay 3", "continuous"),
-        ("train vdpo --env Reacher-v5 --delay 3 --learnin-rate 3", "did you mean learning_rate"),
+        ("train vdpo --env Reacher-v5 --delay 3 --learnin-rate 3", "did you mean --learning-rate"),
         ("train vdpo --env Reacher-v5 --delay 3 --learning-rate high", "invalid float"),
         ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
         ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
         ("evaluate nowhere", "not a run folder"),
+        ("evaluate nowhere --episods 3", "did you mean --episodes"),
         ("watch nowhere --out x.gif", "not a run folder"),
         ("watch nowhere --out x.avi", ".mp4 or .gif"),
         ("fly", "invalid choice"),

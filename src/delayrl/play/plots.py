@@ -1,4 +1,4 @@
-"""Pictures, from rows alone."""
+"""Figures of one run: returns against steps, and against the delay."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -12,7 +12,12 @@ COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
 
 def curve(rows: list[dict[str, Any]], path: Path) -> None:
-    """The learning curve of one run: mean return of each evaluation, and the range of its episodes, against steps."""
+    """Draw the learning curve of a run: the mean and the range of the returns of each evaluation, against steps.
+
+    Args:
+        rows: the rows of the run; nothing is drawn where there are none.
+        path: the file to write.
+    """
     if not rows:
         return
     returns: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -28,7 +33,12 @@ def curve(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def against_delay(results: list[dict[str, Any]], path: Path) -> None:
-    """What one policy returns at each delay: the mean of its episodes, and their range. `results`: of `sweep`."""
+    """Draw the returns of one policy against the delay: the mean and the range of the episodes.
+
+    Args:
+        results: what `sweep` yields, one dictionary for each delay.
+        path: the file to write.
+    """
     first = results[0]
     with _axes(path) as axes:
         _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOURS["agent"], first["agent"])

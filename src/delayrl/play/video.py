@@ -1,4 +1,4 @@
-"""A rendered episode as a file, without a screen."""
+"""Render an episode to a file, without a screen."""
 
 import os
 import sys
@@ -7,21 +7,27 @@ from pathlib import Path
 
 import numpy as np
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 
 
 def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -> tuple[int, float]:
-    """Play one episode of a run's policy and write it to an .mp4 or .gif file.
+    """Play one episode of a run's policy, and write it to an .mp4 or .gif file.
+
+    Args:
+        run: the run folder.
+        out: the file.
+        delay: any delay that the policy can serve; None for the one it was trained for.
+        seed: seed of the start state.
 
     Returns:
         The number of frames, and the return.
 
     Raises:
-        DelayRLError: another kind of file, no run, or no way to render.
+        DelayRLError: another kind of file, no run, a delay longer than in training, or no way to render.
     """
     if out.suffix not in (".mp4", ".gif"):
         raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")
-    from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed
+    from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
 
     check_seed(seed)
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -29,14 +35,13 @@ def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -
     import imageio
 
     from delayrl.envs import make
-    from delayrl.play.evaluation import servable
     from delayrl.play.policy import load
     from delayrl.run.folder import Run
 
     config = Run(run).config
     policy = load(run)
-    late = servable(config["env"], config["delay"] if delay is None else delay, policy.spec)
-    env = make(config["env"], late, render_mode="rgb_array")
+    served = servable(config["env"], config["delay"] if delay is None else delay, policy.spec)
+    env = make(config["env"], served, render_mode="rgb_array")
     obs, info = env.reset(seed=reset_seed(seed, HELD_OUT, 0))
     frames, total, done = [], 0.0, False
     try:
@@ -45,20 +50,20 @@ def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -
             obs, reward, terminated, truncated, info = env.step(policy.act(obs, info))
             total += float(reward)
             done = terminated or truncated
-    except Exception as error:
-        if isinstance(error, DelayRLError):
-            raise
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except DelayRLError:
+        raise
+    except Exception as error:  # a renderer may raise anything
         raise DelayRLError(
-            f"{config['env']} cannot be rendered here ({reason}); on Linux without a screen EGL is needed (libegl1)"
+            f"{config['env']} cannot be rendered here: {first_line(error)}; "
+            "Linux without a screen needs EGL (package libegl1)"
         ) from error
     rate = float(env.metadata.get("render_fps") or 30)
     try:
-        if out.suffix == ".gif":  # viewers do not go faster than 50 frames a second
+        if out.suffix == ".gif":  # viewers show at most 50 frames per second
             stride = max(1, round(rate / 25))
             imageio.mimsave(out, frames[::stride], duration=1000 * stride / rate, loop=0)
         else:
-            with warnings.catch_warnings():  # on the fork that starts the encoder, beside JAX's idle threads
+            with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
                 warnings.simplefilter("ignore", RuntimeWarning)
                 imageio.mimsave(out, frames, fps=rate, macro_block_size=None)
     except OSError as error:

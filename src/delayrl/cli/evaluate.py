@@ -1,0 +1,59 @@
+"""`delayrl evaluate RUN`: play a trained policy."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from delayrl.cli.console import print_table
+from delayrl.errors import DelayRLError
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the run folder, and the episodes to play."""
+    add = parser.add_argument
+    add("run", type=Path, help="the run folder")
+    add("--episodes", type=int, default=10, help="episodes to play (default: 10)")
+    add("--delay", metavar="DELAY", help="a delay up to the longest of the training (default: that of the training)")
+    add("--sweep", action="store_true", help="play every delay from 0 to the longest, and draw a figure")
+    add("--seed", type=int, default=0, help="seed of the start states (default: 0)")
+    add("--json", action="store_true", help="print JSON")
+
+
+def run(given: argparse.Namespace) -> None:
+    """Play the episodes, and print their returns."""
+    from delayrl.play.evaluation import evaluate
+
+    if given.sweep:
+        _sweep(given)
+        return
+    result = evaluate(given.run, given.episodes, given.delay, given.seed)
+    if given.json:
+        print(json.dumps(result))
+        return
+    print(
+        f"{result['agent']} on {result['env']}, delay {result['delay']}: return {result['mean_return']:.1f} "
+        f"± {result['std_return']:.1f} over {result['episodes']} episodes"
+    )
+
+
+def _sweep(given: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    from delayrl.play.evaluation import sweep
+    from delayrl.play.plots import against_delay
+    from delayrl.play.policy import load
+
+    if given.delay is not None:
+        raise DelayRLError("--sweep plays every delay; leave --delay out")
+    delays = load(given.run).spec.delay + 1
+    bar = tqdm(sweep(given.run, given.episodes, given.seed), total=delays, unit="delay", disable=given.json)
+    results = list(bar)
+    if given.json:
+        print(json.dumps(results))
+    else:
+        rows = [[r["delay"], f"{r['mean_return']:.1f}", f"{r['std_return']:.1f}", r["episodes"]] for r in results]
+        print_table(["delay", "mean return", "std", "episodes"], rows)
+    figure = given.run / "delays.png"
+    against_delay(results, figure)
+    print(f"figure: {figure}", file=sys.stderr)

@@ -1,0 +1,21 @@
+"""`delayrl export RUN`: write a run's policy as a bundle."""
+
+import argparse
+from pathlib import Path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the run folder and the folder of the bundle."""
+    add = parser.add_argument
+    add("run", type=Path, help="the run folder")
+    add("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    add("--force", action="store_true", help="replace an existing bundle")
+
+
+def run(given: argparse.Namespace) -> None:
+    """Write the bundle, and print what it holds."""
+    from delayrl.deploy.export import export_run
+
+    metadata = export_run(given.run, given.out, force=given.force)
+    print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages 0..{metadata['ages'][1]}")
+    print(f"  next                     delayrl latency {given.out}")

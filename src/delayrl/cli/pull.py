@@ -1,0 +1,22 @@
+"""`delayrl pull OWNER/NAME`: download a bundle from the Hugging Face Hub."""
+
+import argparse
+from pathlib import Path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the repository and the folder of the bundle."""
+    add = parser.add_argument
+    add("repo", help="OWNER/NAME")
+    add("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    add("--revision", help="a branch, tag or commit")
+    add("--force", action="store_true", help="replace an existing bundle")
+
+
+def run(given: argparse.Namespace) -> None:
+    """Download the bundle, and print what it holds."""
+    from delayrl.deploy.hub import plain, pull
+
+    metadata = pull(given.repo, given.out, revision=given.revision, force=given.force)
+    agent, env, longest = plain(metadata.get("agent")), plain(metadata.get("env")), metadata["policy"]["max_age"]
+    print(f"{given.out}: {agent} on {env}, ages 0..{longest}")

@@ -1,0 +1,92 @@
+"""`delayrl train AGENT`: train an agent, or resume a run."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from delayrl.cli import agents
+from delayrl.cli.parser import Parser
+from delayrl.errors import DelayRLError
+from delayrl.run.folder import Run
+
+
+def add_options(parser: Parser, words: Sequence[str]) -> None:
+    """Add the options of the agent that comes first in `words`, with the defaults of their preset."""
+    from delayrl.agents.registry import find_agent
+
+    if not words or words[0].startswith("-"):
+        if {"-h", "--help"} & set(words):
+            print("usage: delayrl train AGENT --env ID --delay N [options]; `delayrl train AGENT --help` shows them\n")
+            agents.run()
+            parser.exit()
+        raise DelayRLError("name the agent first, e.g. `delayrl train vdpo`; `delayrl agents` lists them")
+    agent = find_agent(words[0])
+    parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary
+    parser.allow_abbrev = False
+    first = Parser(prog=parser.prog, add_help=False)
+    first.add_argument("--preset", choices=list(agent.presets), default="paper")
+    preset = first.parse_known_args(words)[0].preset
+
+    add = parser.add_argument
+    add("agent", help=argparse.SUPPRESS)
+    add("--env", required=True, metavar="ID", help="a Gymnasium task; `delayrl tasks` lists some")
+    add("--delay", default="0", metavar="DELAY", help="steps, or e.g. 80ms, uniform:1:5 (default: 0)")
+    add("--preset", choices=list(agent.presets), default="paper", help="the defaults of the options (default: paper)")
+    add("--seed", type=int, default=0, metavar="K", help="fixes everything (default: 0)")
+    add("--seeds", type=int, default=1, metavar="N", help="train seeds K..K+N-1 in lockstep (default: 1)")
+    add("--out", type=Path, metavar="DIR", help="the run folder (default: below runs/)")
+    add("--device", choices=["cpu", "gpu"], help="where to compute (default: JAX's choice)")
+    add("--overwrite", action="store_true", help="start afresh where a run exists")
+    protocols = ["corrected", "official"]
+    add("--protocol", choices=protocols, default="corrected", help="official: as the released code does")
+    add("--track", choices=["tensorboard", "wandb"], help="log to this service as well")
+    add("--threads", type=int, default=1, help="threads that step the environments (default: 1)")
+    add("--quiet", action="store_true", help="show no progress bar and no notes")
+    base = agent.presets[preset]
+    _add_group(parser, f"schedule (preset {preset})", base.schedule)
+    _add_group(parser, f"hyperparameters (preset {preset})", base.agent)
+
+
+def _add_group(parser: Parser, title: str, config: Any) -> None:
+    from delayrl.run.configuration import options
+
+    group = parser.add_argument_group(title)
+    for option in options(config):
+        settings: dict[str, Any] = {"type": option.kind, "metavar": "VALUE"}
+        default = option.default
+        if get_origin(option.kind) is Literal:
+            settings = {"choices": get_args(option.kind)}
+        elif get_origin(option.kind) is tuple:
+            settings |= {"type": get_args(option.kind)[0], "nargs": "+"}
+            default = " ".join(map(str, default))
+        name = f"--{option.name.replace('_', '-')}"
+        group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+
+
+def run(given: argparse.Namespace) -> None:
+    """Train, and print the results of each run."""
+    from delayrl.training.train import train
+
+    values = vars(given)
+    runs = train(progress=not values.pop("quiet"), **values)
+    for result in runs if isinstance(runs, list) else [runs]:
+        _print_summary(result)
+
+
+def _print_summary(run: Run) -> None:
+    """Print the last returns of a run, its folder, and what to type next."""
+    import numpy as np
+
+    rows, config = run.read("rows"), run.config
+    last = max((row["step"] for row in rows), default=0)
+    print(f"{config['agent']} on {config['env']}, delay {config['delay']}, seed {config['seed']}: {last:,} steps")
+    label = "return under delay" if config["delay"] != 0 else "return"
+    for policy, text in (("agent", label), ("reference", "its reference, no delay")):
+        returns = [row["return"] for row in rows if row["step"] == last and row["policy"] == policy]
+        if returns:
+            print(f"  {text:<24} {np.mean(returns):.1f} ± {np.std(returns):.1f}  ({len(returns)} episodes)")
+    print(f"  run folder               {run.path}")
+    print(f"  learning curve           {run.path / 'curve.png'}")
+    print(f"  next                     delayrl evaluate {run.path} --episodes 20")
+    print(f"                           delayrl watch {run.path} --out episode.gif")
