@@ -1,4 +1,4 @@
-"""`delayrl measure ENV|LOG`: its options, and what it prints."""
+"""`delayrl measure ENV|LOG`: the options and the printed result."""
 
 import argparse
 import importlib
@@ -9,52 +9,49 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 from delayrl.measure.log import Estimated, from_log, plot
 from delayrl.measure.probing import Counts, Probed, probe
 from delayrl.measure.pushes import Env
 from delayrl.measure.reading import UNITS
 
-LOGS = (".csv", ".tsv", ".txt", ".parquet", ".pq")
+SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq")
+COLUMNS = ("time", "commands", "observations", "episode", "stamp", "received")
+LOG_OPTIONS = ("period", *COLUMNS, "unit", "warm_up", "plot", "save")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of `delayrl measure`."""
+    """Add the options of `delayrl measure`."""
     add = parser.add_argument
     add("target", metavar="ENV|LOG", help="a Gymnasium task, module:function that makes one, or a CSV or Parquet file")
     add("--json", action="store_true", help="print one JSON object")
-    add("--seed", type=int, default=0, help="of the episodes, or of the bootstrap (default: 0)")
-    add("--longest", metavar="N|TIME", help="the longest delay looked for: steps (200), or time (100 rows of the log)")
+    add("--seed", type=int, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
+    add("--longest", metavar="N|TIME", help="the longest delay to look for: steps (200), or time (100 rows of the log)")
     probing = parser.add_argument_group("environment")
-    probing.add_argument("--episodes", type=int, help="how many are pushed (default: 8)")
+    probing.add_argument("--episodes", type=int, help="number of episodes (default: 8)")
     log = parser.add_argument_group("log")
     add = log.add_argument
-    add("--period", metavar="TIME", help="of control, e.g. 20ms or 50Hz (default: the spacing of the rows)")
+    add("--period", metavar="TIME", help="control period, e.g. 20ms or 50Hz (default: the spacing of the rows)")
     add("--time", metavar="NAME", help="column of the time stamps (default: time, timestamp or t)")
     add("--commands", metavar="NAME", nargs="+", help="columns, or how they begin (default: command, cmd, action)")
     add("--observations", metavar="NAME", nargs="+", help="columns, or how they begin (default: observation, obs)")
     add("--episode", metavar="NAME", help="column that changes where a new recording begins")
-    add("--stamp", metavar="NAME", help="column of when an observation was made (default: stamp)")
-    add("--received", metavar="NAME", help="column of when it arrived (default: received)")
-    add("--unit", choices=list(UNITS), help="of the time stamps (default: s)")
-    add("--warm-up", metavar="TIME", help="left out at the start (default: a twentieth of the log)")
-    add("--plot", type=Path, metavar="FILE", help="draw it, .png, .svg or .pdf")
+    add("--stamp", metavar="NAME", help="column of the time when an observation was made (default: stamp)")
+    add("--received", metavar="NAME", help="column of the time when it arrived (default: received)")
+    add("--unit", choices=list(UNITS), help="unit of the time stamps (default: s)")
+    add("--warm-up", metavar="TIME", help="time to leave out at the start (default: a twentieth of the log)")
+    add("--plot", type=Path, metavar="FILE", help="plot the result as .png, .svg or .pdf")
     add("--save", type=Path, metavar="FILE", help="write the delays in steps, for --delay recorded:FILE")
 
 
 def run(given: argparse.Namespace) -> None:
-    """Measure, and print."""
+    """Measure the delay and print it."""
     if is_log(given.target):
         _refuse(given, ("episodes",), "an environment", "a log")
         result = from_log(
             given.target,
             seconds("period", given.period),
-            time=given.time,
-            commands=given.commands,
-            observations=given.observations,
-            episode=given.episode,
-            stamp=given.stamp,
-            received=given.received,
+            **{name: getattr(given, name) for name in COLUMNS},
             unit=given.unit or "s",
             longest=seconds("longest", given.longest),
             warm_up=seconds("warm-up", given.warm_up),
@@ -66,55 +63,42 @@ def run(given: argparse.Namespace) -> None:
             result.save(given.save)
         print(json.dumps(result.json()) if given.json else _show_log(result, given.save))
         return
-    names = (
-        "period",
-        "time",
-        "commands",
-        "observations",
-        "episode",
-        "stamp",
-        "received",
-        "unit",
-        "warm_up",
-        "plot",
-        "save",
-    )
-    _refuse(given, names, "a log", "an environment")
+    _refuse(given, LOG_OPTIONS, "a log", "an environment")
     longest = given.longest or "200"
     if not longest.isdecimal():
         raise DelayRLError(f"--longest counts steps of an environment; got {longest!r}")
     episodes = 8 if given.episodes is None else given.episodes
-    probed = probe(find(given.target), episodes, given.seed, int(longest), _bar)
+    probed = probe(find_task(given.target), episodes, given.seed, int(longest), _bar)
     print(json.dumps(probed.json()) if given.json else _show_environment(probed))
 
 
 def is_log(target: str) -> bool:
-    """Whether it is a file, or is named as one."""
-    return Path(target).suffix.lower() in LOGS or Path(target).is_file()
+    """Whether a target is a file, or has the name of a log."""
+    return Path(target).suffix.lower() in SUFFIXES or Path(target).is_file()
 
 
-def find(target: str) -> str | Callable[[], Env]:
-    """The function that `module:function` names; another text is the id of a task."""
+def find_task(target: str) -> str | Callable[[], Env]:
+    """Import the function that `module:function` names; return any other text as it is, the id of a task."""
     name, _, attribute = target.partition(":")
     if not attribute or not re.fullmatch(r"[\w.]+", name):
         return target
-    sys.path.insert(0, "")  # a module beside us, as `python -m` would find it
+    sys.path.insert(0, "")  # also look in the working folder, as `python -m` does
     try:
         module = importlib.import_module(name)
     except Exception as error:  # a module may raise anything
-        raise DelayRLError(f"cannot import {name!r}: {str(error).split(chr(10))[0]}") from error
+        raise DelayRLError(f"cannot import {name!r}: {first_line(error)}") from error
     finally:
         sys.path.remove("")
     function = getattr(module, attribute, None)
     if not callable(function):
         if function is None and "-v" in attribute:
-            return target  # Gymnasium's own module:ID
+            return target  # Gymnasium's own form, module:ID
         raise DelayRLError(f"module {name!r} has no function {attribute!r}")
     return function
 
 
 def seconds(name: str, text: str | None) -> float | None:
-    """A time such as 20ms, 0.02, 0.02s or 50Hz."""
+    """Return a time such as 20ms, 0.02, 0.02s or 50Hz in seconds; `name` is the option that it was given for."""
     if text is None:
         return None
     match = re.fullmatch(r"(\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)\s*(s|ms|us|ns|hz)?", text.strip().lower())
@@ -127,38 +111,26 @@ def seconds(name: str, text: str | None) -> float | None:
 
 
 def _show_environment(p: Probed) -> str:
-    lines = [
-        f"{p.environment}: {p.episodes} episodes of at most {p.length} steps, one action changed at a time",
-        "",
-    ]
-    lines += (
-        _counts("action delay", p.action)
-        + _counts("observation delay", p.observation)
-        + _counts("total delay", p.total)
-    )
-    lines += [
-        "",
-        "0 is no delay: the observation that step(a) returns reacts to that a.",
-        f"Acting is seen from {p.action_from}.",
-    ]
+    lines = [f"{p.environment}: {p.episodes} episodes of at most {p.length} steps, one action changed at a time", ""]
+    for title, counts in (("action", p.action), ("observation", p.observation), ("total", p.total)):
+        lines += _counts(f"{title} delay", counts)
+    lines += ["", "0 is no delay: the observation that step(a) returns reacts to that a."]
+    lines.append(f"Acting is seen from {p.action_from}.")
     if p.lost > 0:
         lines.append(f"{p.lost:.0%} of the actions changed nothing: held, overtaken or without effect where they came.")
     if p.echoes:
-        lines.append(
-            f"Components {_ranges(p.echoes)} of the observation repeat the action itself; they are not counted."
-        )
-    late: dict[int, list[int]] = {}
+        echoes = _ranges(p.echoes)
+        lines.append(f"Components {echoes} of the observation repeat the action itself; they are not counted.")
+    components: dict[int, list[int]] = {}
     for component, steps in enumerate(p.components):
         if steps is not None:
-            late.setdefault(steps, []).append(component)
-    if len(late) > 1:
-        each = "; ".join(f"{_ranges(components)} after {steps}" for steps, components in sorted(late.items()))
+            components.setdefault(steps, []).append(component)
+    if len(components) > 1:
+        each = "; ".join(f"{_ranges(numbers)} after {steps}" for steps, numbers in sorted(components.items()))
         lines.append(f"Components of the observation react at the earliest: {each}.")
     if p.maximum:
-        lines += [
-            "",
-            f"An agent must remember {_plural(p.maximum, 'action')}. The delay is in there already: add none.",
-        ]
+        actions = _plural(p.maximum, "action")
+        lines += ["", f"An agent must remember {actions}. The delay is in there already: add none."]
     return "\n".join(lines)
 
 
@@ -175,55 +147,53 @@ def _counts(title: str, counts: Counts | None) -> list[str]:
 
 
 def _show_log(e: Estimated, saved: Path | None) -> str:
-    def ms(value: float) -> str:
-        return f"{value * 1e3:.4g} ms"
-
-    title = f"{e.path}: {e.rows:,} rows, one each {ms(e.row)}, without the first {e.warm_up:.3g} s"
-    if e.method == "stamps":
-        lines = [
-            title,
-            "",
-            f"delay (received - stamp)  {ms(e.delay)} median, {ms(e.low)} to {ms(e.high)} for 95 % of the observations",
-        ]
-        lines.append(f"{'':<26}{ms(e.longest)} at worst")
-        if e.slowest_warm_up is not None:
-            lines.append(f"{'during the warm-up':<26}{ms(e.slowest_warm_up)} at worst; not counted")
-        lines += [f"{'in steps of ' + ms(e.period):<26}" + _shares(e.counts)]
-        lines.append(
-            "Exact if one clock gave both stamps: an offset between two clocks is in every delay, and cannot be seen."
-        )
-        if e.drift is not None and abs(e.drift) > 200:
-            lines.append(f"The smallest delays change by {e.drift:.0f} parts per million: the clocks may run apart.")
-    else:
-        assert e.peak is not None
-        lines = [
-            title,
-            "",
-            f"dead time                 {ms(e.delay)}, 95 % between {ms(e.low)} and {ms(e.high)}",
-        ]
-        lines.append(f"{'':<26}{e.strength:.1f} times what chance gives in one log of a thousand")
-        lines.append(
-            f"{'increments correlate most':<26}at {ms(e.peak.lag)}, r = {e.peak.r:.2f}, "
-            f"{e.peak.command} and {e.peak.observation}"
-        )
-        lines.append(f"{'':<26}(that is the dead time, the plant's own lag, and a row)")
-        if len(e.windows) > 1:
-            parts = ", ".join(f"{d * 1e3:.4g}" for _, d in e.windows)
-            lines.append(f"{'in parts of the log':<26}{parts} ms")
-        lines.append(
-            f"{'in steps of ' + ms(e.period):<26}{e.step}"
-            + (f"; parts: {_shares(e.counts)}" if len(e.counts) > 1 else "")
-        )
-        if e.high - e.low > 4.5 * e.row:
-            lines.append(
-                "The log does not settle it: the interval is wide. --plot shows what else is there; log more rows."
-            )
-        if e.row > 0.6 * e.period:
-            lines.append("Rows are as far apart as steps: up to one step more cannot be seen. Log faster to see it.")
+    lines = [f"{e.path}: {e.rows:,} rows, one each {_ms(e.row)}, without the first {e.warm_up:.3g} s", ""]
+    lines += _show_stamps(e) if e.method == "stamps" else _show_correlation(e)
     lines += ["", f"train with: --delay {e.train_with}"]
     if saved:
         lines.append(f"        or: --delay recorded:{saved}")
     return "\n".join(lines)
+
+
+def _show_stamps(e: Estimated) -> list[str]:
+    spread = f"{_ms(e.low)} to {_ms(e.high)} for 95 % of the observations"
+    lines = [f"delay (received - stamp)  {_ms(e.delay)} median, {spread}", f"{'':<26}{_ms(e.longest)} at worst"]
+    if e.slowest_warm_up is not None:
+        lines.append(f"{'during the warm-up':<26}{_ms(e.slowest_warm_up)} at worst; not counted")
+    lines.append(f"{'in steps of ' + _ms(e.period):<26}" + _shares(e.counts))
+    lines.append(
+        "Exact if one clock gave both stamps: an offset between two clocks is in every delay, and cannot be seen."
+    )
+    if e.drift is not None and abs(e.drift) > 200:
+        lines.append(f"The smallest delays change by {e.drift:.0f} parts per million: the clocks may run apart.")
+    return lines
+
+
+def _show_correlation(e: Estimated) -> list[str]:
+    assert e.peak is not None
+    peak = f"at {_ms(e.peak.lag)}, r = {e.peak.r:.2f}, {e.peak.command} and {e.peak.observation}"
+    lines = [
+        f"{'dead time':<26}{_ms(e.delay)}, 95 % between {_ms(e.low)} and {_ms(e.high)}",
+        f"{'':<26}{e.strength:.1f} times what chance gives in one log of a thousand",
+        f"{'increments correlate most':<26}{peak}",
+        f"{'':<26}(that is the dead time, the plant's own lag, and a row)",
+    ]
+    if len(e.windows) > 1:
+        parts = ", ".join(f"{delay * 1e3:.4g}" for _, delay in e.windows)
+        lines.append(f"{'in parts of the log':<26}{parts} ms")
+    shares = f"; parts: {_shares(e.counts)}" if len(e.counts) > 1 else ""
+    lines.append(f"{'in steps of ' + _ms(e.period):<26}{e.step}{shares}")
+    if e.high - e.low > 4.5 * e.row:
+        lines.append(
+            "The log does not settle it: the interval is wide. --plot shows what else is there; log more rows."
+        )
+    if e.row > 0.6 * e.period:
+        lines.append("Rows are as far apart as steps: up to one step more cannot be seen. Log faster to see it.")
+    return lines
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.4g} ms"
 
 
 def _shares(counts: Counts) -> str:
@@ -234,7 +204,7 @@ def _shares(counts: Counts) -> str:
 
 
 def _ranges(numbers: Iterable[int]) -> str:
-    """0-3, 7."""
+    """Return numbers as ranges, such as `0-3, 7`."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         if runs and number == runs[-1][1] + 1:
@@ -249,6 +219,7 @@ def _plural(count: int, word: str) -> str:
 
 
 def _refuse(given: argparse.Namespace, names: tuple[str, ...], of: str, target: str) -> None:
+    """Raise DelayRLError if an option was given that the target does not have."""
     for name in names:
         if getattr(given, name) is not None:
             raise DelayRLError(f"--{name.replace('_', '-')} is an option of {of}; {given.target} is taken for {target}")

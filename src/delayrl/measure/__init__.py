@@ -1,6 +1,6 @@
-"""Measure a delay: of an environment, by pushing it (`probe`); of a running system, from its log (`from_log`).
+"""Measure delays: `probe` that of an environment by changing actions, `from_log` that of a running system.
 
-Both need NumPy and Gymnasium alone; matplotlib is imported for a plot, pyarrow for a Parquet file.
+Both need only NumPy and Gymnasium. Plots need matplotlib, and Parquet files pyarrow.
 """
 
 from delayrl.measure.log import Estimated as Estimated

@@ -1,4 +1,4 @@
-"""The delay of a running system from its log: exact where it says when observations were made, else by correlation."""
+"""Estimate the delay of a running system from its log: exactly from stamps of the observations, or by correlation."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,18 +12,18 @@ from delayrl.errors import DelayRLError
 from delayrl.measure import correlate, reading
 from delayrl.measure.correlate import Array
 
-TOLERANCE = 1e-3  # of a step: a delay that exceeds whole steps by less is those whole steps, not one more
+TOLERANCE = 1e-3  # of a step: a smaller excess over whole steps is not rounded up
 BLOCKS = 40
 RESAMPLINGS = 200
 LEAST_ROWS = 200
-WINDOW_ROWS = 400  # at least, of a window of the log with an estimate of its own
+WINDOW_ROWS = 400  # least rows of a part of the log with its own estimate
 WINDOWS = 8
-WARM_UP = 0.05  # of the log, left out at its start where nobody says otherwise
+WARM_UP = 0.05  # of the log, the part that is left out at its start by default
 
 
 @dataclass(frozen=True)
 class Pair:
-    """How a command and an observation correlate, in increments: the largest |r|, and the lag where, in seconds."""
+    """The largest correlation between the increments of a command and an observation, and its lag in seconds."""
 
     command: str
     observation: str
@@ -36,21 +36,25 @@ class Estimated:
     """A delay in seconds, and in steps of a control period.
 
     Attributes:
-        method: "stamps", exact and of each observation; or "correlation", estimated.
-        delay: correlation: the dead time, from a command to the first row that knows of it. stamps: the median.
-        low, high: correlation: the 95 % interval of a block bootstrap, and a row on each side. stamps: the 2.5th and
-            97.5th percentile.
-        row: spacing of the rows in seconds: the resolution of a correlation.
-        strength: of the strongest lag, as a multiple of what chance gives in one log of a thousand.
-        peak: pair with the largest correlation of increments: its lag has the plant's own lag in it.
-        pairs: the strongest pairs.
-        windows: (middle in seconds, dead time) of parts of the log that show one on their own.
-        steps: the delay of each window or observation, in steps, in order of time.
+        method: "stamps" (exact, for each observation) or "correlation" (an estimate).
+        path: of the log.
+        delay: correlation: the dead time, from a command to the first row that reacts. stamps: the median.
+        low, high: correlation: the 95 % interval of a block bootstrap, widened by a row on each side. stamps: the 2.5th
+            and 97.5th percentiles.
+        row: spacing of the rows in seconds, which is the resolution of a correlation.
         period: of control, in seconds.
-        warm_up: seconds left out at the start; rows: how many were used; slowest_warm_up: stamps only.
-        longest: the largest delay seen, of a window or of an observation.
+        rows: how many were used.
+        warm_up: seconds left out at the start.
+        steps: the delay of each window or observation, in steps, in order of time.
+        step: `delay` in steps.
+        strength: of the strongest lag, as a multiple of what chance gives in one of a thousand logs.
+        peak: pair with the largest correlation of increments. Its lag includes the plant's own lag.
+        pairs: the strongest pairs.
+        windows: (middle in seconds, dead time) of each part of the log that shows a dead time on its own.
+        longest: the largest delay of a window or an observation, in seconds.
+        slowest_warm_up: stamps only: the largest delay during the warm-up, in seconds.
+        drift: stamps only: growth of the smallest delays in parts per million, which shows clocks that run apart.
         curve: (dead time, strength, r of the best pair's increments) of every lag.
-        drift: stamps only: growth of the smallest delays, in parts per million: clocks that run apart.
     """
 
     method: str
@@ -75,10 +79,10 @@ class Estimated:
 
     @property
     def train_with(self) -> str:
-        """What `delayrl train --delay` takes.
+        """The argument for `delayrl train --delay`: the steps, or `uniform:LOW:HIGH` if they vary.
 
-        The steps; or `uniform:LOW:HIGH` where they vary. stamps: from the smallest to the 99th percentile; windows:
-        from the 10th to the 90th, because a window is short and its estimate is rough.
+        With stamps, LOW is the smallest delay and HIGH the 99th percentile. With windows, they are the 10th and 90th,
+        because a window is short and its estimate is rough.
         """
         if len(self.steps) < (1 if self.method == "stamps" else 3):
             return str(self.step)
@@ -88,21 +92,21 @@ class Estimated:
 
     @property
     def counts(self) -> dict[int, int]:
-        """How many windows or observations had so many steps."""
+        """How many windows or observations had each number of steps."""
         return dict(sorted(Counter(self.steps).items()))
 
     def save(self, path: Path) -> None:
-        """The steps, one a line, for `--delay recorded:FILE`."""
+        """Write the steps, one a line, for `--delay recorded:FILE`."""
         path.write_text("".join(f"{step}\n" for step in self.steps or (self.step,)))
 
     def json(self) -> dict[str, Any]:
-        """For `json.dumps`."""
+        """Return a dict for `json.dumps`."""
         fields = {"kind": "log", **asdict(self), "train_with": self.train_with}
         return fields | {"steps": {str(step): count for step, count in self.counts.items()}}
 
 
 def whole_steps(seconds: float, period: float) -> int:
-    """Delay in steps: rounded up, because an action that is still on its way must be remembered; see `TOLERANCE`."""
+    """Return a delay in steps, rounded up: an action on its way must be in the history. See `TOLERANCE`."""
     return max(0, int(np.ceil(seconds / period - TOLERANCE)))
 
 
@@ -124,22 +128,22 @@ def from_log(
     """Estimate the delay from a log.
 
     Args:
-        path: CSV or Parquet.
+        path: a CSV or Parquet file.
         period: of control, in seconds; by default the spacing of the rows.
         time: column of the time stamps; by default `time`, `timestamp` or `t`.
-        commands: columns, or how they begin; by default `command`, `cmd`, `action`.
+        commands: columns, or beginnings of their names; by default `command`, `cmd`, `action`.
         observations: the same; by default `observation`, `obs`.
         episode: column that changes where a new recording begins; by default `episode` or `episode_index`, if any.
+        stamp: column of the time when an observation was made, by default `stamp`. If there is a column `received` too,
+            the delays are exact, and commands are ignored.
+        received: column of the time when the observation arrived, by default `received`.
         unit: of time stamps: s, ms, us or ns.
-        stamp: column of the time when an observation was made, by default `stamp`. With `received` the delays are
-            exact, and commands are not looked at.
-        received: column of the time when it arrived, by default `received`.
-        longest: the longest delay that is looked for, in seconds; by default 100 rows, or a tenth of a short log.
+        longest: the longest delay to look for, in seconds; by default 100 rows, or a tenth of a short log.
         warm_up: seconds to leave out at the start; by default a twentieth of the log.
         seed: of the bootstrap.
 
     Raises:
-        DelayRLError: the log cannot be used (the line says where), or shows no delay that is no chance.
+        DelayRLError: the log cannot be used, or shows no delay beyond chance.
     """
     path = Path(path)
     if unit not in reading.UNITS:
@@ -169,8 +173,8 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
     if delays.min() < 0:
         row = int(np.argmin(delays))
         raise DelayRLError(
-            f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made, so the clocks differ by that at "
-            "least; synchronise them (PTP, NTP), or stamp both ends with one clock"
+            f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made, so the clocks differ by at least "
+            "that; synchronise them (PTP, NTP), or stamp both ends with one clock"
         )
     row_spacing = float(np.median(np.diff(made)))
     warm = WARM_UP * float(start[-1]) if warm_up is None else warm_up
@@ -179,9 +183,8 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
         raise DelayRLError(f"{path}: {used.sum()} rows are left after a warm-up of {warm:g} s: too few")
     kept = delays[used]
     period = period or row_spacing
-    edges = np.array_split(np.arange(len(kept)), min(10, len(kept) // 2))
-    floor = [(made[used][part].mean(), kept[part].min()) for part in edges]
-    times, least = np.array(floor).T
+    parts = np.array_split(np.arange(len(kept)), min(10, len(kept) // 2))
+    times, least = np.array([(made[used][part].mean(), kept[part].min()) for part in parts]).T
     return Estimated(
         method="stamps",
         path=str(path),
@@ -222,18 +225,18 @@ def _correlated(
     u, y = correlate.innovations(commands, observations, episode)
     blocks = int(np.clip(rows // (2 * lags), WINDOWS, BLOCKS)) // WINDOWS * WINDOWS  # windows are whole blocks
     sums, sizes = correlate.blocks(u, y, lags, blocks)
-    whole = correlate.correlation(sums, sizes, lags)
-    first = correlate.onset(whole)
+    correlation = correlate.correlation(sums, sizes, lags)
+    first = correlate.onset(correlation)
     if first is None:
         raise DelayRLError(
             f"{path}: no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance. "
             "A longer log, other columns, or commands with some random variation may show one"
         )
     random = np.random.default_rng(seed)
-    found = [correlate.onset(c) for c in correlate.resampled(sums, sizes, lags, RESAMPLINGS, random)]
-    again = [(lag - 1) * row for lag in found if lag is not None]
-    low, high = np.quantile(again, (0.025, 0.975)) if again else (0.0, lags * row)
-    low, high = max(0.0, low - row), high + row  # what lies between two rows is not seen
+    onsets = [correlate.onset(c) for c in correlate.resampled(sums, sizes, lags, RESAMPLINGS, random)]
+    dead_times = [(lag - 1) * row for lag in onsets if lag is not None]
+    low, high = np.quantile(dead_times, (0.025, 0.975)) if dead_times else (0.0, lags * row)
+    low, high = max(0.0, low - row), high + row  # the log does not show what happens between two rows
     windows = []
     count = min(WINDOWS, rows // WINDOW_ROWS)
     for part in np.array_split(np.arange(len(sums)), count) if count > 1 else []:
@@ -241,7 +244,7 @@ def _correlated(
         if lag is not None:
             windows.append((float(warm + part.mean() * sizes[0] * row + sizes[0] * row / 2), (lag - 1) * row))
     pairs, r = _pairs(log, commands, observations, episode, lags, row)
-    strength = correlate.strength(whole)[0]
+    strength = correlate.strength(correlation)[0]
     delay = (first - 1) * row
     return Estimated(
         method="correlation",
@@ -267,7 +270,7 @@ def _correlated(
 def _pairs(
     log: reading.Log, commands: Array, observations: Array, episode: Array, lags: int, row: float
 ) -> tuple[tuple[Pair, ...], Array]:
-    """All pairs by the largest correlation of their increments, and the correlations of the first at lags 1..L."""
+    """Return all pairs, the strongest correlation of increments first, and the correlations of the first pair, [L]."""
     u, y = correlate.increments(commands, episode), correlate.increments(observations, episode)
     sums, sizes = correlate.blocks(u, y, lags, 1)
     near = correlate.correlation(sums, sizes, lags).near
@@ -281,10 +284,14 @@ def _pairs(
 
 
 def plot(estimated: Estimated, out: Path) -> None:
-    """A picture, in the format of the file's ending: how far each lag is from chance; or how often each delay is.
+    """Plot how far each lag is from chance, or with stamps how often each delay occurs.
+
+    Args:
+        estimated: the result of `from_log`.
+        out: the picture; its suffix sets the format.
 
     Raises:
-        DelayRLError: for an ending that matplotlib does not know.
+        DelayRLError: a suffix that matplotlib does not know.
     """
     import matplotlib
 

@@ -1,13 +1,13 @@
-"""The delay that an environment really has, found by pushing it.
+"""Measure the delay that an environment really has, by changing one action at a time.
 
-An episode is played twice from one seed; the second time one action, that of step k, is another. Whatever differs
-afterwards differs because of that action. With the pushes k = 0, 1, 2, … of one episode beside each other,
+An episode is played twice from one seed. The second time, a *push* changes one action, that of step k. Whatever differs
+afterwards differs because of that action. Over the pushes k = 0, 1, 2, … of one episode, the delay at step t is
 
-    what t shows was made t - 1 - max{k : the observation at t differs after push k} steps too late:
+    t - 1 - max{k : the observation at t differs after push k},
 
-the age of the newest action whose effect is in the observation, for every step t, hence a distribution where the
-delay is random (the same seed draws the same delays). Convention: t counts observations, 0 is that of `reset`; the
-delay is 0 when the observation that `step(a)` returns reacts to that a already.
+the age of the newest action whose effect is in the observation. If delays are random this gives their distribution,
+because the same seed repeats them. t counts observations, from that of `reset` at 0. The delay is 0 if the observation
+that `step(a)` returns reacts to that a.
 """
 
 from collections import Counter
@@ -19,33 +19,33 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from delayrl.errors import DelayRLError
-from delayrl.measure.pushes import Array, Env, Pushes, Roll, actions, differs, play, push
+from delayrl.errors import DelayRLError, first_line
+from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push
 
-Counts = dict[int, int]  # steps of delay: how often
+Counts = dict[int, int]  # {steps of delay: how often}
 
-SCALES = (1.0, 0.1, 0.01, 0.001)  # of the push: a smaller one where the largest ends the episode before it is seen
-SCOUTS = 8  # first pushes of an episode, with which the rough delay is found
-SPARE = 32  # steps that are looked at beyond the longest delay
-STARTS = 4  # episodes tried for each scale of the push
+SCALES = (1.0, 0.1, 0.01, 0.001)  # of a push; smaller ones are tried if larger ones end the episode too early
+SCOUTS = 8  # pushes at the start of an episode that give a rough delay
+SPARE = 32  # steps that are examined beyond the longest delay
+STARTS = 4  # episodes tried for each scale
 
 
 @dataclass(frozen=True)
 class Probed:
-    """Delays in environment steps, each as {steps: how often}.
+    """The delays of an environment, in its steps, each as {steps: how often}.
 
     Attributes:
-        total: for each step, the age of the newest action whose effect is in the observation.
-        action: for each action, steps until the state (or, see `action_from`, the reward) reacts; None if unknown.
-        observation: for each step, steps since the shown state; None if unknown.
-        reaction: for each action, steps until an observation first reacts.
-        action_from: what showed that an action had acted.
-        lost: share of the actions that changed nothing at all (overtaken, held, saturated).
-        components: for each component of the observation the fewest steps until it reacts; None: never.
-        echoes: components that repeat the action itself, and are not counted as observing anything.
-        episodes, length, seed: how many episodes of how many steps, from which seed on.
-        scale: size of the push as a share of the largest.
         environment: its name.
+        total: for each step, the age of the newest action whose effect is in the observation.
+        action: for each action, steps until the state (or the reward, see `action_from`) reacts; None if unknown.
+        observation: for each step, the age of the shown state; None if unknown.
+        reaction: for each action, steps until an observation first reacts.
+        action_from: what shows that an action has acted.
+        lost: share of the actions that changed nothing (overtaken, held, saturated).
+        components: for each component of the observation, the fewest steps until it reacts; None if it never does.
+        echoes: components that repeat the action itself, and do not count as a reaction.
+        episodes, length, seed: how many episodes of how many steps, and the first seed.
+        scale: size of the push, relative to the largest.
     """
 
     environment: str
@@ -64,11 +64,11 @@ class Probed:
 
     @property
     def maximum(self) -> int:
-        """The longest total delay: the number of actions that an agent has to remember."""
+        """The longest total delay, which is the number of actions that an agent must remember."""
         return max(self.total)
 
     def json(self) -> dict[str, Any]:
-        """For `json.dumps`."""
+        """Return a dict for `json.dumps`."""
         return {"kind": "environment", **asdict(self), "maximum": self.maximum}
 
 
@@ -84,26 +84,25 @@ def probe(
     Args:
         env: an id of Gymnasium's registry, an environment, or a function without arguments that makes one. Its actions
             must be a `Box`; observations may be any space that Gymnasium can flatten.
-        episodes: how many, from seeds `seed`, `seed + 1`, …
-        seed: the first of them.
-        longest: the longest delay that is looked for, in steps.
-        wrap: goes around the episodes, e.g. a progress bar.
+        episodes: how many to play, from the seeds `seed`, `seed + 1`, …
+        seed: of the first episode.
+        longest: the longest delay to look for, in steps.
+        wrap: wraps the episodes, for example in a progress bar.
 
     Raises:
-        DelayRLError: the environment does not repeat itself, or nothing ever reacts; other actions than a `Box`.
+        DelayRLError: the actions are not a `Box`, the environment does not repeat itself, or no observation reacts.
     """
     if episodes < 1 or longest < 1:
         raise DelayRLError(f"episodes and longest count from 1; got {episodes} and {longest}")
-    made = not isinstance(env, gym.Env)
     task = _make(env)
     try:
         return _probe(task, episodes, seed, longest, wrap)
     except DelayRLError:
         raise
     except Exception as error:  # an environment may raise anything
-        raise DelayRLError(f"{task} failed while it was played: {_line(error)}") from error
+        raise DelayRLError(f"{task} failed while it was played: {_described(error)}") from error
     finally:
-        if made:
+        if task is not env:
             task.close()
 
 
@@ -115,36 +114,32 @@ def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Ite
     steps = 0
     while steps < delay + SPARE:
         steps = delay + SPARE
-        found = [push(env, seed + e, scale, steps) for e in wrap(range(episodes))]
-        ages = [_total(pushes.obs) for pushes in found]
-        delay = min(max(delay, *(int(age.max()) for age in ages)), longest)  # random ones may be longer than the first
-    return _gather(name, found, ages, delay, steps, episodes, seed, scale)
+        pushes = [push(env, seed + e, scale, steps) for e in wrap(range(episodes))]
+        ages = [_total(p.obs) for p in pushes]
+        delay = min(max(delay, *(int(age.max()) for age in ages)), longest)  # random delays may exceed the first
+    return _gather(name, pushes, ages, delay, steps, episodes, seed, scale)
 
 
 def _gather(
-    name: str, found: list[Pushes], ages: list[Array], oldest: int, steps: int, episodes: int, seed: int, scale: float
+    name: str, pushes: list[Pushes], ages: list[Array], oldest: int, steps: int, episodes: int, seed: int, scale: float
 ) -> Probed:
     oldest = max((int(age.max()) for age in ages if (age >= 0).any()), default=oldest)
-    # the first steps of an episode cannot show old actions, there are none: they would make delays look shorter
-    total = Counter(int(a) for age in ages for t, a in enumerate(age) if a >= 0 and t > oldest)
-    late = [p.channel("obs") - 1 - np.arange(len(p.obs)) for p in found]
-    reaction = Counter(int(d) for p, delays in zip(found, late, strict=True) for d in _settled(p, delays, oldest))
+    total = _count_ages(ages, oldest)
+    reaction = Counter(d for p in pushes for d in _settled(p, "obs", oldest))
     if not total and not reaction:
         raise DelayRLError(f"{name}: its episodes end too early to see a delay of about {oldest} steps")
-    lost = [(p.obs[k, 1:] != 1).all() for p in found for k in range(len(p.obs)) if _watched(p, k, oldest)]
-    action_from, channel = _acts(found)
+    lost = [(p.obs[k, 1:] != 1).all() for p in pushes for k in range(len(p.obs)) if _is_long_enough(p, k, oldest)]
+    action_from, channel = _action_channel(pushes)
     action: Counts | None = None
     observation: Counts | None = None
     if channel:
-        delays = [p.channel(channel) - 1 - np.arange(len(p.obs)) for p in found]
-        action = Counter(int(d) for p, each in zip(found, delays, strict=True) for d in _settled(p, each, oldest))
-        shown = [_shown(p.obs, p.channel(channel)) for p in found]
-        observation = Counter(int(a) for age in shown for t, a in enumerate(age) if a >= 0 and t > oldest)
-    echo = np.any([p.echo.any(0) for p in found], axis=0)
-    each = np.concatenate(
-        [np.where(p.components > 0, p.components - 1 - np.arange(len(p.obs))[:, None], -1) for p in found]
+        action = Counter(d for p in pushes for d in _settled(p, channel, oldest))
+        observation = _count_ages([_shown(p.obs, p.channel(channel)) for p in pushes], oldest)
+    echo = np.any([p.echo.any(0) for p in pushes], axis=0)
+    reactions = np.concatenate(
+        [np.where(p.components > 0, p.components - 1 - np.arange(len(p.obs))[:, None], -1) for p in pushes]
     )
-    least = np.where(each >= 0, each, np.iinfo(int).max).min(0)
+    fewest = np.where(reactions >= 0, reactions, np.iinfo(int).max).min(0)
     return Probed(
         environment=name,
         total=_ordered(total or reaction),
@@ -153,7 +148,7 @@ def _gather(
         reaction=_ordered(reaction),
         action_from=action_from,
         lost=float(np.mean(lost)) if lost else 0.0,
-        components=tuple(None if (each[:, c] < 0).all() else int(least[c]) for c in range(each.shape[1])),
+        components=tuple(None if (reactions[:, c] < 0).all() else int(steps) for c, steps in enumerate(fewest)),
         echoes=tuple(int(c) for c in np.flatnonzero(echo)),
         episodes=episodes,
         length=steps,
@@ -163,7 +158,7 @@ def _gather(
 
 
 def _scout(env: Env, name: str, seed: int, longest: int) -> tuple[float, int]:
-    """A size of the push whose effect is seen before the episode ends, and roughly after how many steps it is."""
+    """Return a scale whose effect shows before the episode ends, and the rough delay of that effect, in steps."""
     steps = longest + SCOUTS
     best: tuple[int, float, int] | None = None
     played = 0
@@ -174,7 +169,7 @@ def _scout(env: Env, name: str, seed: int, longest: int) -> tuple[float, int]:
             _check_repeats(name, base, play(env, start, chosen))
             played = max(played, len(base.obs) - 1)
             pushes = push(env, start, scale, steps, SCOUTS, base)
-            delays = pushes.channel("obs") - 1 - np.arange(len(pushes.obs))
+            delays = pushes.delays("obs")
             if (delays >= 0).any():
                 delay = int(delays.max())
                 followed = int(np.median((pushes.obs >= 0).sum(1)))  # steps until an episode ends after a push
@@ -187,58 +182,58 @@ def _scout(env: Env, name: str, seed: int, longest: int) -> tuple[float, int]:
         ended = "" if played == steps else f" (no episode was longer than {played} steps)"
         raise DelayRLError(
             f"{name}: no observation reacted to an action within {min(played, longest)} steps{ended}: the delay is "
-            "longer, or what is observed does not depend on actions"
+            "longer, or observations do not depend on actions"
         )
     return best[1], best[2]
 
 
-def _check_repeats(name: str, one: Roll, two: Roll) -> None:
-    length = min(len(one.obs), len(two.obs))
+def _check_repeats(name: str, played: Rollout, again: Rollout) -> None:
+    length = min(len(played.obs), len(again.obs))
     same = np.ones(length, bool)
-    for a, b in ((one.obs, two.obs), (one.state, two.state), (one.rest, two.rest)):
+    for a, b in ((played.obs, again.obs), (played.state, again.state), (played.rest, again.rest)):
         same &= ~differs(a[:length], b[:length]).any(1)
-    if not same.all() or len(one.obs) != len(two.obs):
+    if not same.all() or len(played.obs) != len(again.obs):
         step = int(np.argmin(same)) if not same.all() else length
         raise DelayRLError(
             f"{name} does not repeat itself: two roll-outs with the same seed and actions differ at step {step}. "
-            "Let reset(seed=…) fix all its random numbers (draw them from self.np_random, wrappers too), or probe it "
-            "without its noise"
+            "Let reset(seed=…) fix all random numbers (sample them from self.np_random, in wrappers too), or probe it "
+            "without noise"
         )
 
 
-def _acts(found: list[Pushes]) -> tuple[str, str]:
-    """By what an action is seen to act: the state, or else the first reward (or end of the episode) that differs."""
+def _action_channel(pushes: list[Pushes]) -> tuple[str, str]:
+    """Return what shows that an action has acted, in words and as a channel: the state, or else the first reward."""
     for channel, label in (
-        ("state", found[0].state_from),
+        ("state", pushes[0].state_from),
         ("rest", "the first reward that differs (no state is visible)"),
     ):
-        pairs = [(a, o) for p in found for a, o in zip(p.channel(channel), p.channel("obs"), strict=True) if o > 0]
+        pairs = [(a, o) for p in pushes for a, o in zip(p.channel(channel), p.channel("obs"), strict=True) if o > 0]
         acted = [a > 0 and a <= o for a, o in pairs]
         if label and acted and all(acted):
             return label, channel
     return "nothing: no state is visible and rewards do not react before observations", ""
 
 
-def _total(seen: Array) -> Array:
-    """Age at each step t of the newest action that has an effect, [T+1]; -1 where it is not known."""
-    count, length = seen.shape
+def _total(effect: Array) -> Array:
+    """Return the age at each step of the newest action with an effect, [T+1]; -1 if unknown."""
+    count, length = effect.shape
     ages = np.full(length, -1)
     for t in range(1, length):
         if t > count:
             break
-        column = seen[:t, t]
+        column = effect[:t, t]
         newest = np.flatnonzero(column == 1)
         if newest.size and (column[newest[-1] + 1 :] == 0).all():
             ages[t] = t - 1 - newest[-1]
     return ages
 
 
-def _shown(seen: Array, acted: Array) -> Array:
-    """Age at each step t of the shown state, [T+1]; -1 where the pushes leave more than one possibility."""
-    count, length = seen.shape
+def _shown(effect: Array, acted: Array) -> Array:
+    """Return the age at each step of the shown state, [T+1]; -1 if the pushes leave more than one possibility."""
+    count, length = effect.shape
     ages = np.full(length, -1)
     for t in range(1, min(length, count + 1)):
-        column = seen[:t, t]
+        column = effect[:t, t]
         reached = acted[:t][(column == 1) & (acted[:t] > 0)]
         if not reached.size:
             continue
@@ -251,14 +246,21 @@ def _shown(seen: Array, acted: Array) -> Array:
     return ages
 
 
-def _watched(pushes: Pushes, k: int, longest: int) -> bool:
-    """Whether push k was followed for so long that any effect would have been seen."""
+def _is_long_enough(pushes: Pushes, k: int, longest: int) -> bool:
+    """Whether enough steps follow push k to show any effect."""
     t = k + 1 + longest
     return t < pushes.obs.shape[1] and bool(pushes.obs[k, t] != -1)
 
 
-def _settled(pushes: Pushes, delays: Array, longest: int) -> list[int]:
+def _settled(pushes: Pushes, channel: str, longest: int) -> list[int]:
+    """Return the delays of the pushes that enough steps follow."""
+    delays = pushes.delays(channel)
     return [int(d) for k, d in enumerate(delays) if d >= 0 and k + 1 + longest < pushes.obs.shape[1]]
+
+
+def _count_ages(ages: list[Array], oldest: int) -> Counts:
+    """Count the known ages, without the first steps of an episode, in which no action can be old."""
+    return Counter(int(a) for age in ages for t, a in enumerate(age) if a >= 0 and t > oldest)
 
 
 def _ordered(counts: Counts) -> Counts:
@@ -275,7 +277,7 @@ def _make(env: str | Env | Callable[[], Env]) -> Env:
     try:
         made = env()
     except Exception as error:
-        raise DelayRLError(f"{getattr(env, '__name__', env)}() failed: {_line(error)}") from error
+        raise DelayRLError(f"{getattr(env, '__name__', env)}() failed: {_described(error)}") from error
     if not isinstance(made, gym.Env):
         raise DelayRLError(
             f"{getattr(env, '__name__', env)}() must return a Gymnasium environment; got {type(made).__name__}"
@@ -283,5 +285,5 @@ def _make(env: str | Env | Callable[[], Env]) -> Env:
     return made
 
 
-def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error).strip() or '-'}".splitlines()[0]
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {first_line(error)}"

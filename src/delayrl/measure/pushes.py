@@ -1,4 +1,4 @@
-"""Roll-outs of one episode from one seed, and what differs in them after one action is another."""
+"""Roll-outs of one episode from one seed, and what differs in them after one action is changed."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,58 +16,76 @@ STATES = ("MuJoCo's qpos and qvel", "env.unwrapped.state", 'info["truth"]')
 
 
 @dataclass(frozen=True)
-class Roll:
-    """One roll-out of T steps: row t is what was there after t steps; `state` may have no columns."""
+class Rollout:
+    """One roll-out of T steps. Row t is what was there after t steps."""
 
     obs: Array  # [T+1, C]
-    state: Array  # [T+1, S]
-    rest: Array  # [T+1, 3] reward, terminated, truncated
+    state: Array  # [T+1, S]; S = 0 if the state is hidden
+    rest: Array  # [T+1, 3]: reward, terminated, truncated
     state_from: str
 
 
 @dataclass(frozen=True)
 class Pushes:
-    """All pushes k of one episode: at [k, t] whether it differs after push k, and -1 where one had ended before."""
+    """The effects of all pushes in one episode. Push k changes the action of step k.
+
+    At [k, t], `obs`, `state` and `rest` say whether step t differs after push k; -1 if a roll-out ended before.
+    """
 
     obs: Array  # int8 [K, T+1]
-    state: Array
-    rest: Array
-    components: Array  # int [K, C] first difference, or -1
-    echo: Array  # bool [K, C]
+    state: Array  # int8 [K, T+1]
+    rest: Array  # int8 [K, T+1]
+    components: Array  # int [K, C]: step of the first difference, or -1
+    echo: Array  # bool [K, C]: whether the component repeats the action
     state_from: str
 
     def channel(self, name: str) -> Array:
-        """First difference of each push in obs, state or rest, or -1."""
+        """Return the step of the first difference of each push in obs, state or rest, [K]; -1 if there is none."""
         return first(getattr(self, name))
 
+    def delays(self, name: str) -> Array:
+        """Return the steps from each push to the first difference, [K]; negative if there is none."""
+        return self.channel(name) - 1 - np.arange(len(self.obs))
 
-def push(env: Env, seed: int, scale: float, steps: int, count: int | None = None, base: Roll | None = None) -> Pushes:
-    """One episode of at most `steps` steps, and again for each of its first `count` actions (default: all)."""
+
+def push(
+    env: Env, seed: int, scale: float, steps: int, count: int | None = None, base: Rollout | None = None
+) -> Pushes:
+    """Play an episode, and again with each action changed in turn.
+
+    Args:
+        env: the environment.
+        seed: of the episode and its actions.
+        scale: size of the push, relative to the range of the actions.
+        steps: longest length of the episode.
+        count: how many actions are changed, from the first on; None for all.
+        base: the episode without a push, if it has been played.
+    """
     low, high = _bounds(env)
     chosen = actions(env, seed, steps, scale)
     base = base or play(env, seed, chosen)
     signs = np.random.default_rng([seed, 3]).choice([-1.0, 1.0], chosen.shape)  # towards a random corner of the box
     length = len(base.obs)
     count = min(count or steps, length - 1)
-    seen = {name: np.full((count, length), -1, np.int8) for name in ("obs", "state", "rest")}
+    effect = {name: np.full((count, length), -1, np.int8) for name in ("obs", "state", "rest")}
     components = np.full((count, base.obs.shape[1]), -1)
     echo = np.zeros(components.shape, bool)
     for k in range(count):
         pushed = chosen.copy()
         pushed[k] = ((low + high) / 2 + scale * signs[k] * (high - low) / 2).astype(chosen.dtype)
         roll = play(env, seed, pushed[: length - 1])
-        known = min(length, len(roll.obs))
-        apart = differs(base.obs[:known], roll.obs[:known])
-        components[k] = first(apart.T.astype(np.int8))
+        played = min(length, len(roll.obs))
+        different = differs(base.obs[:played], roll.obs[:played])
+        components[k] = first(different.T.astype(np.int8))
         echo[k] = _echo(components[k], base.obs, roll.obs, chosen[k], pushed[k])
-        seen["obs"][k, :known] = (apart & ~echo[k]).any(1)
-        seen["state"][k, :known] = differs(base.state[:known], roll.state[:known]).any(1)
-        seen["rest"][k, :known] = differs(base.rest[:known], roll.rest[:known]).any(1)
-    return Pushes(seen["obs"], seen["state"], seen["rest"], np.where(echo, -1, components), echo, base.state_from)
+        effect["obs"][k, :played] = (different & ~echo[k]).any(1)
+        effect["state"][k, :played] = differs(base.state[:played], roll.state[:played]).any(1)
+        effect["rest"][k, :played] = differs(base.rest[:played], roll.rest[:played]).any(1)
+    return Pushes(effect["obs"], effect["state"], effect["rest"], np.where(echo, -1, components), echo, base.state_from)
 
 
-def play(env: Env, seed: int, chosen: Array) -> Roll:
-    """Play these actions from this seed, to their end or that of the episode."""
+def play(env: Env, seed: int, chosen: Array) -> Rollout:
+    """Play actions, [T, A], from a seed, until they or the episode end."""
     obs, info = env.reset(seed=seed)
     state, state_from = _state(env, info)
     observations, states, rest = [_flat(env, obs)], [state], [(0.0, False, False)]
@@ -78,11 +96,11 @@ def play(env: Env, seed: int, chosen: Array) -> Roll:
         rest.append((float(reward), terminated, truncated))
         if terminated or truncated:
             break
-    return Roll(np.array(observations), np.array(states), np.array(rest, float), state_from)
+    return Rollout(np.array(observations), np.array(states), np.array(rest, float), state_from)
 
 
 def actions(env: Env, seed: int, steps: int, scale: float) -> Array:
-    """Small random actions around the middle of the box: it keeps still, and yet no action equals another."""
+    """Sample small actions around the middle of the box, [T, A]: little happens, yet all actions differ."""
     low, high = _bounds(env)
     random = np.random.default_rng([seed, 2])
     spread = 0.1 * scale * random.uniform(-1, 1, (steps, *low.shape))
@@ -91,12 +109,12 @@ def actions(env: Env, seed: int, steps: int, scale: float) -> Array:
 
 def _flat(env: Env, obs: Any) -> Array:
     if isinstance(env.observation_space, Box):
-        return np.array(obs).ravel()  # a copy: an environment may go on writing into what it has returned
+        return np.array(obs).ravel()  # a copy, because an environment may reuse the array
     return np.array(flatten(env.observation_space, obs), float).ravel()
 
 
 def _state(env: Env, info: dict[str, Any]) -> tuple[Array, str]:
-    """The simulator's true state where it can be seen, else nothing."""
+    """Return the simulator's true state and where it was read; an empty array and "" if it is hidden."""
     data = getattr(env.unwrapped, "data", None)
     if hasattr(data, "qpos") and hasattr(data, "qvel"):
         return np.concatenate([np.array(data.qpos).ravel(), np.array(data.qvel).ravel()]), STATES[0]  # type: ignore[union-attr]
@@ -110,25 +128,25 @@ def _state(env: Env, info: dict[str, Any]) -> tuple[Array, str]:
 
 
 def _echo(first: Array, base: Array, roll: Array, action: Array, pushed: Array) -> Array:
-    """Components whose first difference is the action itself: an observation that contains past actions."""
+    """Return which components first differ by the action itself, [C]: the observation contains past actions."""
     column = np.arange(len(first))
     before, after = base[first, column][:, None], roll[first, column][:, None]
     near = np.isclose(before, action.ravel(), rtol=1e-6, atol=0) & np.isclose(after, pushed.ravel(), rtol=1e-6, atol=0)
     return (first > 0) & near.any(1)
 
 
-def differs(one: Array, two: Array) -> Array:
-    """Elementwise, to the last bit."""
-    return (one != two) & ~((one != one) & (two != two))  # NaN equals NaN
+def differs(a: Array, b: Array) -> Array:
+    """Compare exactly, element by element; NaN equals NaN."""
+    return (a != b) & ~((a != a) & (b != b))
 
 
-def first(seen: Array) -> Array:
-    """Index of the first 1 in each row, or -1."""
-    return np.where((seen == 1).any(1), (seen == 1).argmax(1), -1)
+def first(effect: Array) -> Array:
+    """Return the index of the first 1 in each row, or -1."""
+    return np.where((effect == 1).any(1), (effect == 1).argmax(1), -1)
 
 
 def _bounds(env: Env) -> tuple[Array, Array]:
-    """Bounds of the actions; where there are none, ±1."""
+    """Return the bounds of the actions, [A] each; ±1 for a missing bound."""
     space = env.action_space
     assert isinstance(space, Box)
     low, high = space.low.astype(float), space.high.astype(float)

@@ -1,16 +1,16 @@
-"""Logs from CSV and Parquet files, checked: every way in which a log can be wrong is one line that names the place."""
+"""Read and check logs in CSV and Parquet files. Every error names the row or column that is wrong."""
 
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 
 Array = NDArray[np.float64]
 
@@ -18,20 +18,20 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PREFIXES = {"commands": ("command", "cmd", "action"), "observations": ("observation", "obs")}
 TIMES = ("time", "timestamp", "t")
 EPISODES = ("episode", "episode_index")
-GAP = 20  # rows that may be missing before what follows counts as another recording
+GAP = 20  # rows that may be missing within one recording
 
 
 @dataclass(frozen=True)
 class Log:
-    """Signals of N rows; times in seconds from the first. `episode` numbers stretches without a break.
+    """Signals of N rows; `episode` numbers the recordings.
 
-    A row is what was known when its command was sent: the newest observation then, and the command.
+    A row holds what was known when its command was sent: the newest observation at that time, and the command.
     """
 
-    time: Array
+    time: Array  # [N], seconds from the first row
     commands: Array  # [N, U]
     observations: Array  # [N, Y]
-    episode: Array
+    episode: Array  # [N]
     command_names: tuple[str, ...]
     observation_names: tuple[str, ...]
 
@@ -44,7 +44,7 @@ def read_signals(
     episode: str | None = None,
     unit: str = "s",
 ) -> Log:
-    """Time stamps, commands and observations of a log.
+    """Read the time stamps, commands and observations of a log.
 
     Args:
         path: a CSV file with a header (commas, semicolons or tabs), or Parquet.
@@ -55,7 +55,7 @@ def read_signals(
         unit: of the time stamps: s, ms, us or ns.
 
     Raises:
-        DelayRLError: for anything that is wrong with the file.
+        DelayRLError: the file cannot be used.
     """
     table = _Table(path)
     stamps = table.find(time, TIMES, "time stamps", "--time")
@@ -65,37 +65,27 @@ def read_signals(
         names = [n for n in table.names if n != stamps and n.lower().startswith(tuple(s.lower() for s in starts))]
         if not names:
             raise DelayRLError(
-                f"{path}: no column for {what}: none begins with {' or '.join(starts)}; name them with --{what}. "
+                f"{path} has no column for {what}: none begins with {' or '.join(starts)}; name them with --{what}. "
                 f"It has {_few(table.names)}"
             )
         groups[what] = names
     both = set(groups["commands"]) & set(groups["observations"])
     if both:
-        raise DelayRLError(
-            f"{path}: {_few(sorted(both))} would be a command and an observation; name them with --commands"
-        )
+        raise DelayRLError(f"{path}: {_few(sorted(both))} would be both a command and an observation; use --commands")
     number = table.find(episode, EPISODES, "episodes", "--episode", needed=episode is not None)
     seconds = table.column(stamps) * UNITS[unit]
     episodes = table.column(number) if number else np.zeros(len(seconds))
     _check_times(path, stamps, seconds, episodes)
-    columns: list[Array] = []
-    labels: list[tuple[str, ...]] = []
-    for what in ("commands", "observations"):
-        found = [table.matrix(name) for name in groups[what]]
-        columns.append(np.concatenate(found, 1))
-        labels.append(tuple(
-            name if block.shape[1] == 1 else f"{name}[{i}]"
-            for name, block in zip(groups[what], found, strict=True)
-            for i in range(block.shape[1])
-        ))  # fmt: skip
-    for values, what in zip(columns, ("command", "observation"), strict=True):
+    us, u_names = table.join(groups["commands"])
+    ys, y_names = table.join(groups["observations"])
+    for values, what in ((us, "command"), (ys, "observation")):
         if (values == values[0]).all():
-            raise DelayRLError(f"{path}: every {what} is constant: nothing can be learned of a delay from it")
-    return Log(seconds - seconds[0], columns[0], columns[1], episodes, labels[0], labels[1])
+            raise DelayRLError(f"{path}: every {what} is constant, which shows nothing about a delay")
+    return Log(seconds - seconds[0], us, ys, episodes, u_names, y_names)
 
 
 def read_stamps(path: Path, stamp: str | None, received: str | None, unit: str) -> tuple[Array, Array] | None:
-    """When observations were made and when they arrived, in seconds; None if the log does not say both."""
+    """Return when observations were made and when they arrived, in seconds, [N] each; None without both columns."""
     table = _Table(path)
     made = table.find(stamp, ("stamp",), "send times", "--stamp", needed=stamp is not None)
     arrived = table.find(received, ("received",), "arrival times", "--received", needed=received is not None)
@@ -105,10 +95,13 @@ def read_stamps(path: Path, stamp: str | None, received: str | None, unit: str) 
 
 
 def resample(log: Log) -> tuple[Log, float]:
-    """The log on a uniform grid of its median row spacing, which is returned too, in seconds.
+    """Put a log on a uniform grid.
 
-    Each grid point, half a row after a row, takes the newest row: holding never brings a value in before it was there,
-    as interpolation would. Rows that are as good as uniform are taken as they are.
+    Each grid point takes the newest row before it. Interpolation would use values before they were there. Rows that are
+    nearly uniform stay as they are.
+
+    Returns:
+        The new log, and the spacing of its rows in seconds: the median of the old one.
     """
     gaps = np.diff(log.time)
     inside = log.episode[1:] == log.episode[:-1]
@@ -125,21 +118,13 @@ def resample(log: Log) -> tuple[Log, float]:
             rows.append(own[np.searchsorted(log.time[own], grid, "right") - 1])
             counts.append(np.full(len(grid), piece))
         taken, numbers = np.concatenate(rows), np.concatenate(counts)
-    return (
-        Log(
-            np.arange(len(taken), dtype=float) * step,
-            log.commands[taken],
-            log.observations[taken],
-            numbers.astype(float),
-            log.command_names,
-            log.observation_names,
-        ),
-        step,
-    )
+    time, episode = np.arange(len(taken), dtype=float) * step, numbers.astype(float)
+    observations = log.observations[taken]
+    return replace(log, time=time, commands=log.commands[taken], observations=observations, episode=episode), step
 
 
 class _Table:
-    """Columns of a file, as text or numbers."""
+    """The columns of a file, as text or numbers."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -154,7 +139,7 @@ class _Table:
             raise DelayRLError(f"{path} has no rows")
 
     def find(self, given: str | None, usual: tuple[str, ...], what: str, option: str, needed: bool = True) -> str:
-        """Name of the column, or "" if there is none and none is needed."""
+        """Return the name of a column: the given one or else a usual one, or "" if there is none and none is needed."""
         wanted = (given,) if given else usual
         for name in wanted:
             if name in self._columns:
@@ -167,29 +152,37 @@ class _Table:
         return ""
 
     def column(self, name: str) -> Array:
-        """One number a row."""
+        """Return a column of numbers, [N]."""
         values = self.matrix(name)
         if values.shape[1] != 1:
             raise DelayRLError(f"{self.path}: column {name} holds vectors; it must hold one number a row")
         return values[:, 0]
 
     def matrix(self, name: str) -> Array:
-        """Numbers, [N, 1] or, for a column of vectors, [N, size]."""
+        """Return a column of numbers as [N, 1], or one of vectors as [N, size]."""
         cells = self._columns[name]
         try:
             values = np.array(cells, float)
         except (TypeError, ValueError):
             row = next((i for i, cell in enumerate(cells) if not _number(cell)), 0)
-            shown = "an empty cell" if cells[row] in ("", None) else f"{cells[row]!r}, which is no number"
+            shown = "an empty cell" if cells[row] in ("", None) else f"{cells[row]!r}, which is not a number"
             raise DelayRLError(f"{self.path}, row {row + 1}: column {name} has {shown}") from None
         values = values.reshape(len(values), -1)
-        wrong = ~np.isfinite(values).all(1)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise DelayRLError(
-                f"{self.path}, row {row + 1}: column {name} has {cells[row]}; drop such rows or fill them"
-            )
+        invalid = ~np.isfinite(values).all(1)
+        if invalid.any():
+            row = int(np.argmax(invalid))
+            where = f"{self.path}, row {row + 1}"
+            raise DelayRLError(f"{where}: column {name} has {cells[row]}; drop such rows or fill them")
         return values
+
+    def join(self, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
+        """Return several columns side by side, and a label for each number in a row."""
+        blocks = {name: self.matrix(name) for name in names}
+        labels: list[str] = []
+        for name, block in blocks.items():
+            size = block.shape[1]
+            labels += [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+        return np.concatenate(list(blocks.values()), 1), tuple(labels)
 
 
 def _csv(path: Path) -> dict[str, list[str]]:
@@ -225,7 +218,7 @@ def _parquet(path: Path) -> dict[str, Any]:
     try:
         table = parquet.read_table(path)
     except (pyarrow.ArrowException, OSError) as error:
-        raise DelayRLError(f"{path} is a damaged Parquet file: {str(error).splitlines()[0]}") from None
+        raise DelayRLError(f"{path} is a damaged Parquet file: {first_line(error)}") from None
     return {name: table.column(name).to_pylist() for name in table.column_names}
 
 
@@ -237,8 +230,8 @@ def _check_times(path: Path, name: str, seconds: Array, episodes: Array) -> None
         row = int(np.argmax(gaps <= 0)) + 1
         what = "repeats" if gaps[row - 1] == 0 else "goes back"
         raise DelayRLError(
-            f"{path}, row {row + 1}: {name} {what}; time stamps must increase (sort the rows, drop duplicates; a "
-            "column named with --episode says where a new recording begins)"
+            f"{path}, row {row + 1}: {name} {what}; time stamps must increase. Sort the rows, drop duplicates, or name "
+            "a column with --episode that changes where a new recording begins"
         )
 
 

@@ -24,11 +24,8 @@ class Clock:
 
     Args:
         stamps: the unit of all times.
-        dt: seconds a step, for stamps in seconds; None for stamps in steps.
-        read: returns the present time, for stamps in seconds.
-
-    Raises:
-        DelayRLError: an unknown unit, or a `dt` that does not go with it.
+        dt: seconds a step; None for stamps in steps.
+        read: returns the present time in seconds.
     """
 
     def __init__(self, stamps: Stamps, dt: Any, read: Callable[[], float]) -> None:
@@ -44,11 +41,7 @@ class Clock:
         self.period = 1.0 if dt is None else float(dt)
 
     def number(self, time: float) -> float:
-        """Return a time as a float.
-
-        Raises:
-            DelayRLError: not a number, or a fraction of a step.
-        """
+        """Return a time as a float. Raises DelayRLError if it is not a number, or a fraction of a step."""
         if isinstance(time, bool | np.bool_) or not isinstance(time, int | float | np.integer | np.floating):
             raise DelayRLError(f"a time is a number of {self.stamps}; got {time!r}")
         try:
@@ -60,12 +53,7 @@ class Clock:
         return value
 
     def now(self, now: float | None, step: int) -> float:
-        """Return `now` as a float; where it is None, the time on the clock, or `step` with stamps in steps.
-
-        Raises:
-            DelayRLError: not a number, or a fraction of a step.
-            ClockError: not finite, or out of range.
-        """
+        """Return `now` as a float; if it is None, the time on the clock, or `step` with stamps in steps."""
         if now is None:
             now = self._read() if self.stamps == "seconds" else step
         value = self.number(now)

@@ -36,9 +36,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.runtime.clock import Clock, Stamps
-from delayrl.deploy.runtime.episode import Arrival, Episode
+from delayrl.deploy.runtime.episode import Episode
 from delayrl.deploy.runtime.history import Action, History
-from delayrl.deploy.runtime.telemetry import Statistics, Telemetry
+from delayrl.deploy.runtime.telemetry import Arrival, Statistics, Telemetry
 from delayrl.errors import DelayRLError
 
 OnOverrun = Literal["hold", "clip", "raise"]
@@ -143,7 +143,7 @@ class Controller:
     def statistics(self) -> Statistics:
         """What has happened so far, as a snapshot."""
         with self._state_lock:
-            return self._telemetry.snapshot(self._episode.history)
+            return self._telemetry.snapshot()
 
     def reset(self, now: float | None = None) -> None:
         """Start an episode: forget observations and actions. Later stamps before `now` (seconds) are ignored.
@@ -153,7 +153,6 @@ class Controller:
         """
         with self._act_lock, self._state_lock:
             start = 0.0 if self.stamps == "steps" else self._clock.now(now, 0)
-            self._telemetry.end_episode(self._episode.history)
             self._episode = Episode(self.episode + 1, start, self._clock, self._new_history())
 
     def observe(self, obs: ArrayLike, stamp: float, now: float | None = None, *, episode: int | None = None) -> Arrival:
@@ -168,7 +167,7 @@ class Controller:
                 steps, which start again at 0, if an observation may arrive after its episode has ended.
 
         Returns:
-            What became of it; see `Arrival`.
+            What became of it: "new", "late", "duplicate", "invalid" or "future". `Statistics` explains these.
 
         Raises:
             DelayRLError: a wrong size, or a stamp that is not a number or a fraction of a step.
@@ -176,7 +175,7 @@ class Controller:
         values, stamp = _observation(self.policy, obs), self._clock.number(stamp)
         with self._state_lock:
             arrival = self._episode.observe(values, stamp, now, episode)
-            self._telemetry.count(arrival)
+            self._telemetry.counts[arrival] += 1
         return arrival
 
     def act(self, now: float | None = None) -> Action:
@@ -201,14 +200,14 @@ class Controller:
                 newest = self._episode.newest(now)
                 age, action = newest.age, self._episode.history.last.copy()
                 if age > limit:
-                    self._telemetry.count("overruns")
+                    self._telemetry.counts["overruns"] += 1
                     if self.on_overrun == "raise":
                         raise OverrunError(f"the policy was trained for ages 0..{limit}; the newest is {age} steps old")
             if age <= limit or (self.on_overrun == "clip" and len(newest.actions) == age):
                 action = _decide(policy, newest.obs, newest.actions, min(age, limit))
             with self._state_lock:
                 period = self._episode.record(action, now)
-                self._telemetry.count("decisions")
+                self._telemetry.counts["decisions"] += 1
                 if newest.warm:
                     self._telemetry.add(age, newest.delay, period)
         return action.copy()
@@ -223,7 +222,7 @@ class Controller:
         values = _action(self.policy, action, "the action")
         with self._act_lock, self._state_lock:
             self._episode.record(values, self._episode.command_time(now))
-            self._telemetry.count("overridden")
+            self._telemetry.counts["overridden"] += 1
 
     def applied(self, action: ArrayLike, step: int | None = None) -> bool:
         """Correct the history where the plant did something else: an actuator saturated, a packet was lost.
@@ -249,7 +248,8 @@ class Controller:
     def _new_history(self) -> History:
         first = _in_range(self.policy, np.zeros(self.policy.action_size, np.float32))
         capacity = self.policy.max_age + self.action_delay + EXTRA_STEPS
-        return History(self._clock.period, self.action_delay, capacity, self._idle, first)
+        counts = self._telemetry.counts
+        return History(self._clock.period, self.action_delay, capacity, self._idle, first, counts)
 
 
 def _action_delay(policy: ControlPolicy, given: Any) -> int:

@@ -1,22 +1,15 @@
 """The state of one episode: the newest observation, the commands, and the times that are still possible."""
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.deploy.runtime.clock import LARGEST_TIME, Clock, ClockError
 from delayrl.deploy.runtime.history import Action, History
+from delayrl.deploy.runtime.telemetry import Arrival
 from delayrl.errors import DelayRLError
-
-Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
-"""What became of an observation.
-
-Only "new" ones are used: the newest so far. The others: "late" is older than the newest, or of another episode;
-"duplicate" has the stamp of the newest; "invalid" is not finite in single precision, or has a stamp beyond ±1e15 or a
-step below 0; "future" is stamped more than half a period after it arrived.
-"""
 
 
 class Newest(NamedTuple):
@@ -34,14 +27,7 @@ class Newest(NamedTuple):
 
 
 class Episode:
-    """Judge observations and record commands.
-
-    Args:
-        number: how many episodes came before.
-        start: when it begins; -inf if the first observation or command is to set it.
-        clock: checks the times.
-        history: the empty history.
-    """
+    """Judge observations and record commands. A start of -inf leaves it to the first observation or command."""
 
     def __init__(self, number: int, start: float, clock: Clock, history: History) -> None:
         self.number, self.history = number, history
@@ -76,12 +62,7 @@ class Episode:
         return time
 
     def newest(self, now: float) -> Newest:
-        """Return the newest observation with its age, for a command at `now`.
-
-        Raises:
-            DelayRLError: no observation has arrived.
-            ClockError: the observation was made more than half a period after `now`.
-        """
+        """Return the newest observation with its age. Raises DelayRLError if none has arrived before `now`."""
         if self._obs is None:
             raise DelayRLError("no observation has arrived in this episode: wait until `controller.ready`")
         if self._stamp > now + self._clock.period / 2:

@@ -21,15 +21,17 @@ class History:
         capacity: how many steps are remembered.
         idle: the action of a step without a command, [A]; None to go on with the action before.
         first: the action before any other, [A].
+        counts: the counters `missed` and `replaced`, which `record` updates.
     """
 
-    def __init__(self, period: float, lead: int, capacity: int, idle: Action | None, first: Action) -> None:
+    def __init__(
+        self, period: float, lead: int, capacity: int, idle: Action | None, first: Action, counts: dict[str, int]
+    ) -> None:
         self._period, self.lead, self._capacity = period, lead, capacity
-        self._idle, self._first = idle, first
+        self._idle, self._first, self._counts = idle, first, counts
         self._begins: deque[float] = deque(maxlen=capacity)
         self._actions: deque[Action] = deque(maxlen=capacity)
         self.length = 0
-        self.missed = self.replaced = 0
 
     @property
     def last(self) -> Action:
@@ -70,9 +72,9 @@ class History:
         gap, added = self._gap(now, elapsed), self._begins_up_to(now, elapsed)
         if gap == 0:
             self._actions[-1] = action
-            self.replaced += 1
+            self._counts["replaced"] += 1
             return
-        self.missed += gap - 1 if self.length else elapsed
+        self._counts["missed"] += gap - 1 if self.length else elapsed
         self._actions.extend([*[self._uncommanded()] * (len(added) - 1), action])
         self._begins.extend(added)
         self.length += gap

@@ -2,9 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from delayrl.deploy.runtime.clock import Stamps
-from delayrl.deploy.runtime.history import History
+
+Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
+"""What became of an observation; see `Statistics`. Only new ones are used."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,10 @@ class Statistics:
         missed: steps without a command of their own.
         replaced: commands that another one replaced less than half a period later.
         overridden: commands that somebody else gave.
-        new: observations that were used.
-        late: observations older than the newest, or of an earlier episode.
+        new: observations that were used: each the newest when it arrived.
+        late: observations older than the newest, or of another episode.
         duplicate: observations with the stamp of the newest.
-        invalid: observations with values or stamps that are not finite or out of range, or of steps below 0.
+        invalid: observations that are not finite in single precision, or have a stamp beyond ±1e15 or a step below 0.
         future: observations stamped more than half a period after they arrived.
     """
 
@@ -84,18 +87,13 @@ class Moments:
 
 
 class Telemetry:
-    """Collect the numbers of `Statistics` while a controller runs."""
+    """Collect the numbers of `Statistics` while a controller runs; `counts` are its plain counters."""
 
     def __init__(self, stamps: Stamps) -> None:
         self._stamps = stamps
-        names = ("decisions", "overruns", "overridden", "new", "late", "duplicate", "invalid", "future")
-        self._counts = dict.fromkeys(names, 0)
-        self._missed = self._replaced = 0  # in earlier episodes
+        names = ("decisions", "overruns", "missed", "replaced", "overridden", *get_args(Arrival))
+        self.counts = dict.fromkeys(names, 0)
         self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
-
-    def count(self, name: str) -> None:
-        """Count an event by its name in `Statistics`."""
-        self._counts[name] += 1
 
     def add(self, age: int, delay: float, period: float) -> None:
         """Add a decision: the age in steps, the time since its observation was made and since the last command."""
@@ -104,17 +102,10 @@ class Telemetry:
             self._delays.add(delay)
             self._periods.add(period)
 
-    def end_episode(self, history: History) -> None:
-        """Add the missed and replaced steps of an episode that is over to the totals."""
-        self._missed += history.missed
-        self._replaced += history.replaced
-
-    def snapshot(self, history: History) -> Statistics:
-        """Return the totals, with those of the present episode's history."""
+    def snapshot(self) -> Statistics:
+        """Return all numbers so far."""
         return Statistics(
-            **self._counts,
-            missed=self._missed + history.missed,
-            replaced=self._replaced + history.replaced,
+            **self.counts,
             counted=self._ages.count,
             age_mean=self._ages.mean,
             age_std=self._ages.std,
