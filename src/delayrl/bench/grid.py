@@ -1,14 +1,14 @@
-"""Grids: a TOML file (agents × tasks × delays × seeds × overrides) becomes cells.
+"""Grids: expand a TOML file of agents, tasks, delays, seeds and overrides into cells.
 
 ```toml
 description = "…"
 preset = "small"                     # and protocol = "corrected" (default) or "official"
-seeds = 3                            # 0, 1, 2; or a list of consecutive ones
-tasks = ["delayrl/Reacher-v4"]       # what stands here holds for every product that does not say otherwise
+seeds = 3                            # 0, 1, 2; or a list of consecutive seeds
+tasks = ["delayrl/Reacher-v4"]       # top-level keys are the defaults of every product
 
-[overrides]                          # hyperparameters and schedule, of all agents …
+[overrides]                          # hyperparameters and schedule options of all agents …
 steps = 5_000
-[overrides.vdpo]                     # … and of one
+[overrides.vdpo]                     # … and of one agent
 width = 64
 
 [[product]]
@@ -20,30 +20,28 @@ agents = ["sac"]
 delays = [0]
 ```
 
-A cell is one lockstep group of seeds. Its id is the hash of all that it is made of, defaults included: how it is
-written in a file does not matter, and two grids that hold the same cell share it.
+A cell is one lockstep group of seeds. Its id hashes the resolved configuration, defaults included. So the way a file is
+written does not change ids, and grids that contain the same cell share its results.
 """
 
 import functools
-import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from delayrl.agents.base import Agent, Schedule
-from delayrl.agents.registry import AGENTS
-from delayrl.delays import as_delay
-from delayrl.envs import delay_of, make
+from delayrl.agents.registry import AGENTS, find_agent
+from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
-from delayrl.run.configuration import values_of
-from delayrl.training.train import check_fit, find_agent, resolve
+from delayrl.run.cell import Cell
+from delayrl.run.condition import Setup, resolve
+from delayrl.training.train import check_fit
 
 PRODUCT = {
     "agents": list,
@@ -60,40 +58,8 @@ DEFAULTS: dict[str, Any] = {"preset": "paper", "protocol": "corrected", "seeds":
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One lockstep group of seeds of one agent on one delayed task."""
-
-    agent: str
-    env: str
-    delay: int | str
-    """Environment steps, or a delay law in words."""
-    preset: str
-    protocol: str
-    seeds: tuple[int, ...]
-    overrides: dict[str, Any]
-    steps: int
-    """Environment steps that each seed trains."""
-    id: str
-
-    @property
-    def label(self) -> int | str:
-        """The delay as rows name it: a long list of numbers is shortened."""
-        return as_delay(self.delay).label()
-
-    @property
-    def folder(self) -> str:
-        """Name of its folder: readable, and of its own."""
-        return re.sub(r"[^\w.-]+", "-", f"{self.env}-delay{self.label}-{self.agent}-{self.id}")
-
-    def __str__(self) -> str:
-        first, last = self.seeds[0], self.seeds[-1]
-        seeds = f"seed {first}" if first == last else f"seeds {first}-{last}"
-        return f"{self.agent} on {self.env}, delay {self.label}, {seeds}"
-
-
-@dataclass(frozen=True)
 class Grid:
-    """A grid file: its name, where it was read, its cells in the order in which they are worked off."""
+    """A grid that was read from a file. Its cells are in the order in which they start."""
 
     name: str
     description: str
@@ -107,41 +73,44 @@ class Grid:
 
     @property
     def ids(self) -> list[str]:
-        """The cells' ids."""
+        """The ids of its cells."""
         return [cell.id for cell in self.cells]
 
 
 def shipped() -> dict[str, Path]:
-    """The grids that come with the package, by name."""
+    """Return the files of the grids that come with the package, by name."""
     home = Path(str(files("delayrl.bench") / "grids"))
     return {path.stem: path for path in sorted(home.glob("*.toml"))}
 
 
 def load_grid(grid: str | Path) -> Grid:
-    """A grid by the path of its TOML file, or by the name of one that comes with the package.
+    """Read a grid and check that every cell can be trained.
+
+    Args:
+        grid: the path of a TOML file, or the name of a grid that comes with the package.
 
     Raises:
-        DelayRLError: no such grid, no TOML, an unknown key, agent, task or hyperparameter, nothing to run, a cell
+        DelayRLError: no such grid, invalid TOML, an unknown key, agent, task or hyperparameter, nothing to run, a cell
             that cannot be trained, the same run in two cells.
     """
-    return _load(grid, Path(), included=False)
-
-
-def _load(grid: str | Path, beside: Path, included: bool) -> Grid:
-    source = _find(str(grid), beside)
+    source = _find(str(grid), Path())
+    table = _read(source)
     try:
-        table = tomllib.loads(source.read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DelayRLError(f"{source} is no TOML file: {error}") from error
-    try:
-        return _parse(table, source, included)
+        cells = _expand(table, source)
+        name = table.get("name", source.stem)
+        if not re.fullmatch(r"[\w.-]+", name):
+            raise DelayRLError(f"a grid's name has letters, digits, '.', '_' and '-'; got {name!r}")
+        _check_overlap(cells)
     except DelayRLError as error:
-        raise DelayRLError(f"{source.name}: {error}" if not included else str(error)) from error
+        raise DelayRLError(f"{source.name}: {error}") from error
+    tasks = list(dict.fromkeys(cell.condition.env for _, cell in cells))
+    ordered = sorted((cell for _, cell in cells), key=lambda cell: tasks.index(cell.condition.env))  # task by task
+    return Grid(name, " ".join(table.get("description", "").split()), source, tuple(ordered))
 
 
-def _find(grid: str, beside: Path) -> Path:
+def _find(grid: str, folder: Path) -> Path:
     if grid.endswith(".toml") or "/" in grid:
-        path = beside / grid
+        path = folder / grid
         if not path.is_file():
             raise DelayRLError(f"there is no grid file {path}")
         return path
@@ -150,16 +119,22 @@ def _find(grid: str, beside: Path) -> Path:
     return shipped()[grid]
 
 
-def _parse(table: dict[str, Any], source: Path, included: bool) -> Grid:
+def _read(source: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(source.read_text())
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DelayRLError(f"{source} is not a valid TOML file: {error}") from error
+
+
+def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list[tuple[Setup, Cell]]:
+    """Return the cells of a grid's table and of the grids that it includes, each with its setup."""
     _check_keys(table, GRID, "the grid")
-    name = table.get("name", source.stem)
-    if not re.fullmatch(r"[\w.-]+", name):
-        raise DelayRLError(f"a grid's name has letters, digits, '.', '_' and '-'; got {name!r}")
-    cells: list[Cell] = []
     if included and "include" in table:
-        raise DelayRLError(f"{source.name} includes other grids, and so cannot be included")
+        raise DelayRLError(f"{source.name} includes other grids, so it cannot be included")
+    cells: list[tuple[Setup, Cell]] = []
     for other in table.get("include", []):
-        cells += _load(other, source.parent, included=True).cells
+        path = _find(str(other), source.parent)
+        cells += _expand(_read(path), path, included=True)
     own = [key for key in ("agents", "tasks", "delays") if key in table]
     products = table.get("product", [{}] if own or not cells else [])
     if not all(isinstance(item, dict) for item in products):
@@ -174,23 +149,20 @@ def _parse(table: dict[str, Any], source: Path, included: bool) -> Grid:
             raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
     if not cells:
         raise DelayRLError("there are no products, so nothing to run")
-    _check_overlap(cells)
-    tasks = {cell.env: i for i, cell in reversed(list(enumerate(cells)))}
-    cells.sort(key=lambda cell: tasks[cell.env])  # a task is finished before the next one begins
-    return Grid(name, " ".join(table.get("description", "").split()), source, tuple(cells))
+    return cells
 
 
 def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], what: str) -> None:
     for key, value in table.items():
         if key not in known:
-            raise DelayRLError(f"unknown key {key!r} of {what}; there are {', '.join(known)}")
+            raise DelayRLError(f"unknown key {key!r} of {what}; allowed are {', '.join(known)}")
         if not isinstance(value, known[key]) or isinstance(value, bool):
-            words = {list: "a list", dict: "a table", str: "a text", int: "a whole number"}
+            words = {list: "a list", dict: "a table", str: "a string", int: "a whole number"}
             raise DelayRLError(f"{key} must be {words.get(known[key], 'a number or a list')}; got {value!r}")
 
 
 def _merge(*tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Overrides of all, then of a product; an agent's own table is merged, not replaced."""
+    """Merge overrides; later tables win. The tables of a single agent are merged too."""
     merged: dict[str, Any] = {}
     for table in tables:
         for key, value in table.items():
@@ -201,7 +173,8 @@ def _merge(*tables: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _cells(table: dict[str, Any]) -> Iterable[Cell]:
+def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
+    """Yield the cells of one product."""
     for key in ("agents", "tasks", "delays"):
         if not table.get(key):
             raise DelayRLError(f"there are no {key}, so nothing to run")
@@ -215,24 +188,25 @@ def _cells(table: dict[str, Any]) -> Iterable[Cell]:
         if isinstance(value, dict) and name not in AGENTS:
             find_agent(name)
     shared = {name: value for name, value in table["overrides"].items() if not isinstance(value, dict)}
-    groups = _groups(table["seeds"], table.get("lockstep"))
+    groups = _seed_groups(table["seeds"], table.get("lockstep"))
     for env, delay, agent in product(table["tasks"], table["delays"], table["agents"]):
-        overrides = shared | table["overrides"].get(agent, {})
+        overrides = json.dumps(shared | table["overrides"].get(agent, {}), default=str)
+        try:
+            setup = _setup(agent, env, delay, table["preset"], table["protocol"], overrides)
+        except DelayRLError as error:
+            raise DelayRLError(f"{agent} on {env}, delay {delay}: {error}") from error
         for seeds in groups:
-            try:
-                yield _cell(agent, env, delay, table["preset"], table["protocol"], seeds, overrides)
-            except DelayRLError as error:
-                raise DelayRLError(f"{agent} on {env}, delay {delay}: {error}") from error
+            yield setup, Cell(setup.condition, seeds, setup.cell_id(seeds))
 
 
-def _groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int, ...]]:
+def _seed_groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int, ...]]:
     numbers = list(range(seeds)) if isinstance(seeds, int) else seeds
     if not numbers:
         raise DelayRLError("there are no seeds, so nothing to run")
     if any(isinstance(seed, bool) or not isinstance(seed, int) for seed in numbers):
-        raise DelayRLError(f"seeds are whole numbers; got {seeds!r}")
+        raise DelayRLError(f"seeds must be whole numbers; got {seeds!r}")
     if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
-        raise DelayRLError(f"seeds of one product follow each other, as in [3, 4, 5]; got {seeds!r}")
+        raise DelayRLError(f"seeds of one product must be consecutive, as in [3, 4, 5]; got {seeds!r}")
     check_seed(numbers[0])
     check_seed(numbers[-1])
     size = len(numbers) if lockstep is None else lockstep
@@ -241,44 +215,22 @@ def _groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int, ...
     return [tuple(numbers[i : i + size]) for i in range(0, len(numbers), size)]
 
 
-def _cell(
-    agent: str, env: str, delay: Any, preset: str, protocol: str, seeds: tuple[int, ...], overrides: dict[str, Any]
-) -> Cell:
-    config, schedule = resolve(agent, preset, protocol, overrides)
-    delay = _check(config, schedule, env, delay)
-    whole = {
-        "agent": agent,
-        "env": env,
-        "delay": delay,
-        "preset": preset,
-        "protocol": protocol,
-        "seeds": seeds,
-        "hyperparameters": values_of(config),
-        "schedule": values_of(schedule),
-    }
-    digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
-    return Cell(agent, env, delay, preset, protocol, seeds, overrides, schedule.steps, digest[:12])
-
-
-@functools.cache
-def _check(agent: Agent, schedule: Schedule, env: str, delay: int | str) -> int | str:
-    """The delay as runs write it down; DelayRLError where the cell could not be trained."""
-    late = delay_of(env, delay)
-    task = make(env, late.observed())
-    check_fit(agent, schedule, task)
+@functools.cache  # it builds the task; overrides are JSON to be a key of the cache
+def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str, overrides: str) -> Setup:
+    """Resolve a condition. Raises DelayRLError if it cannot be trained."""
+    setup = resolve(agent, env, delay, preset, protocol, json.loads(overrides))
+    task = make(env, setup.delay.observed())
+    check_fit(setup.agent, setup.schedule, task)
     task.close()
-    return late.plain()
+    return setup
 
 
-def _check_overlap(cells: list[Cell]) -> None:
-    """No run may be in two cells: its rows would count twice."""
-    seen: dict[str, Cell] = {}
-    for cell in cells:
-        config, schedule = resolve(cell.agent, cell.preset, cell.protocol, cell.overrides)
-        names = [field.name for field in fields(Cell) if field.name not in ("seeds", "overrides", "id")]
-        what = json.dumps([[getattr(cell, n) for n in names], values_of(config), values_of(schedule)])
+def _check_overlap(cells: list[tuple[Setup, Cell]]) -> None:
+    """Raise DelayRLError if a run is in two cells: its rows would count twice."""
+    first: dict[tuple[str, int], Cell] = {}
+    for setup, cell in cells:
+        configuration = setup.cell_id(())
         for seed in cell.seeds:
-            key = f"{what} {seed}"
-            if key in seen:
-                raise DelayRLError(f"two cells hold the same run: {cell} ({cell.id}) and {seen[key]} ({seen[key].id})")
-            seen[key] = cell
+            other = first.setdefault((configuration, seed), cell)
+            if other is not cell:
+                raise DelayRLError(f"two cells hold the same run: {cell} ({cell.id}) and {other} ({other.id})")

@@ -1,40 +1,28 @@
 """Rows of a grid, from its run folders or from the table that is published.
 
-The table is one SQLite file: Python reads and writes it without another library, so does most other software, it is
-queried where it lies, and it keeps doubles and whole numbers exactly. What holds for a run stands once. The same
-rows give the same bytes, so that a committed table changes only where results do.
+The table is one SQLite file. Python reads and writes it without another library, most other software reads it too, and
+it keeps doubles and integers exactly. Columns that are constant within a run are stored once. The same rows give the
+same bytes, so a committed table changes only where results do.
 """
 
 import contextlib
 import json
-import math
-import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args
+from urllib.parse import quote
 
 from delayrl.bench import folders
-from delayrl.bench.folders import Progress, State
-from delayrl.bench.grid import Cell, Grid
+from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
+from delayrl.run.cell import Cell, Progress, State
+from delayrl.run.disk import draft
 from delayrl.run.folder import Run
+from delayrl.run.rows import EPISODE, Row, check_row
 
 SCHEMA = 1
-Row = dict[str, Any]
-OWN = {"step": int, "policy": str, "episode": int, "reset_seed": int, "return": float, "length": int}
-"""What differs between the rows of a run, and of which type it is; the rest stands once for each run."""
-CELL: dict[str, Any] = {
-    "agent": str,
-    "env": str,
-    "delay": int | str,
-    "preset": str,
-    "protocol": str,
-    "seeds": list,
-    "overrides": dict,
-    "steps": int,
-}
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE cells (id TEXT PRIMARY KEY, number INTEGER, cell TEXT, state TEXT, step INTEGER, steps_per_second REAL);
@@ -51,148 +39,147 @@ CREATE VIEW results AS
 
 
 def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
-    """Rows of the cells as the run folders hold them now, each with its cell's id."""
+    """Yield the rows of cells from their run folders, each with its cell's id.
+
+    Raises:
+        DelayRLError: a damaged row.
+    """
     for cell in cells:
         for path in folders.seed_folders(runs / cell.folder, cell.seeds):
-            for row in _read(path):
+            for row in _read_rows(path):
                 yield row | {"cell": cell.id}
 
 
-def _read(path: Path) -> list[Row]:
-    rows = Run(path).read("rows")
-    for row in rows:
-        whole = isinstance(row, dict) and all(type(row.get(name)) is kind for name, kind in OWN.items())
-        if not whole or not math.isfinite(row["return"]):
-            raise DelayRLError(f"{path} holds a damaged row: {str(row)[:200]}")
-    return rows
+def _read_rows(path: Path) -> list[Row]:
+    return [check_row(row, path) for row in Run(path).read("rows")]
 
 
 def collect(grid: Grid, runs: Path, out: Path) -> int:
-    """Write what a grid has now into a table; returns the number of rows.
+    """Write the rows and the standing of a grid into a table. Returns the number of rows.
 
     Raises:
         DelayRLError: no rows yet, a damaged run, a row that is there twice, `out` is the table of another grid.
     """
     if out.exists():
-        with _reading(out) as table:
+        with _open(out) as table:
             name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
         if name != grid.name:
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
     if next(rows_of(grid.cells, runs), None) is None:
         raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
-    draft = out.with_name(f".{out.name}-{os.getpid()}.draft")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        draft.unlink(missing_ok=True)
-        with contextlib.closing(sqlite3.connect(draft)) as table:
-            count = _fill(table, grid, runs)
-        draft.replace(out)
+        with draft(out, shared=True) as file, contextlib.closing(sqlite3.connect(file)) as table:
+            return _fill(table, grid, runs)
     except (OSError, sqlite3.OperationalError) as error:
         raise DelayRLError(f"cannot write {out}: {error}") from error
-    finally:
-        draft.unlink(missing_ok=True)
-    return count
 
 
 def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
-    count = 0
     table.executescript("PRAGMA page_size = 4096; PRAGMA journal_mode = OFF;" + TABLES)
     meta = {"schema": str(SCHEMA), "grid": grid.name, "description": grid.description}
     table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+    count = 0
     for number, cell in enumerate(grid.cells):
         p = progress(cell, runs)
-        text = _json({key: value for key, value in vars(cell).items() if key != "id"})
-        table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", (cell.id, number, text, p.state, p.step, p.speed))
-        used = _versions(runs / cell.folder)
+        values = (cell.id, number, _json(cell.json), p.state, p.step, p.speed)
+        table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", values)
+        later = _journal_versions(runs / cell.folder)
         for path, seed in zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True):
-            rows = _read(path)
-            if not rows:
-                continue
-            config = dict(Run(path).config)
-            first = config.pop("versions", None)
-            distinct = _distinct(([first] if first else []) + used)
-            shared = {k: v for k, v in rows[0].items() if k not in OWN and all(row.get(k) == v for row in rows)}
-            values = (cell.id, seed, _json(shared), _json(config), _json(distinct))
-            run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", values).lastrowid
-            for row in rows:
-                more = {k: v for k, v in row.items() if k not in OWN and k not in shared}
-                line = (run, *(row[name] for name in OWN), _json(more) if more else None)
-                try:
-                    table.execute("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", line)
-                except sqlite3.IntegrityError as error:
-                    raise DelayRLError(f"{path} holds an episode twice: step {row['step']}, {row['policy']}") from error
-                count += 1
+            count += _insert_run(table, cell, path, seed, later)
     table.commit()
     table.execute("VACUUM")
     return count
 
 
+def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, later: list[dict[str, Any]]) -> int:
+    """Insert a run and its rows, if it has any. Returns their number."""
+    rows = _read_rows(path)
+    if not rows:
+        return 0
+    config = dict(Run(path).config)
+    first = config.pop("versions", None)
+    versions = _distinct(([first] if first else []) + later)
+    shared = {k: v for k, v in rows[0].items() if k not in EPISODE and all(row.get(k) == v for row in rows)}
+    run = table.execute(
+        "INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)",
+        (cell.id, seed, _json(shared), _json(config), _json(versions)),
+    ).lastrowid
+    for row in rows:
+        more = {k: v for k, v in row.items() if k not in EPISODE and k not in shared}
+        values = (run, *(row[name] for name in EPISODE), _json(more) if more else None)
+        try:
+            table.execute("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
+        except sqlite3.IntegrityError as error:
+            raise DelayRLError(f"{path} holds an episode twice: step {row['step']}, {row['policy']}") from error
+    return len(rows)
+
+
 def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
-    """With what the cells were worked on: versions of libraries, commit, hardware; each once."""
+    """Return the versions, commits and hardware that cells were trained with, without duplicates."""
     paths = [path for cell in cells for path in folders.seed_folders(runs / cell.folder, cell.seeds)]
     first = [Run(path).config.get("versions") for path in paths if (path / "config.json").exists()]
-    return _distinct([v for v in first if v] + [v for cell in cells for v in _versions(runs / cell.folder)])
+    return _distinct([v for v in first if v] + [v for cell in cells for v in _journal_versions(runs / cell.folder)])
 
 
 def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [value for i, value in enumerate(values) if value not in values[:i]]
 
 
-def _versions(folder: Path) -> list[dict[str, Any]]:
-    """With what a cell was worked on: more than one where it went on elsewhere, or after an update."""
+def _journal_versions(folder: Path) -> list[dict[str, Any]]:
+    """Return the versions of each start of a cell: they differ where it was resumed elsewhere or after an update."""
     return [event["versions"] for event in folders.journal(folder) if "versions" in event]
 
 
 def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list[dict[str, Any]]]:
-    """Rows of a collected table, its cells with how far they were, and with what they were worked on.
+    """Read a collected table.
+
+    Returns:
+        Its rows, as `rows_of` yields them; its cells with how far they were; the versions that they were trained with.
 
     Raises:
-        DelayRLError: no table of ours, or of another schema version.
+        DelayRLError: not a table of ours, a damaged one, or one with another schema version.
     """
-    with _reading(file) as table:
-        cells = []
-        columns = "id, cell, state, step, steps_per_second"
-        for key, text, state, step, speed in table.execute(f"SELECT {columns} FROM cells ORDER BY number"):
-            values = json.loads(text)
-            wrong = [name for name, kind in CELL.items() if not isinstance(values[name], kind)]
-            if wrong or state not in get_args(State) or type(step) is not int:
-                raise ValueError(f"cell {key} has no good {', '.join(wrong) or 'state'}")
-            cell = Cell(**(values | {"seeds": tuple(values["seeds"]), "id": key}))
-            cells.append((cell, Progress(state, step, speed, "")))
+    with _open(file) as table:
+        cells = [
+            _stored_cell(*values)
+            for values in table.execute("SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number")
+        ]
         shared = {
             run: json.loads(text) | {"cell": cell}
             for run, cell, text in table.execute("SELECT id, cell, shared FROM runs")
         }
-        columns = ", ".join(OWN)
         rows = [
-            shared[run] | dict(zip(OWN, values, strict=True)) | (json.loads(more) if more else {})
-            for run, more, *values in table.execute(f"SELECT run, more, {columns} FROM rows")
+            shared[run] | dict(zip(EPISODE, values, strict=True)) | (json.loads(more) if more else {})
+            for run, more, *values in table.execute(f"SELECT run, more, {', '.join(EPISODE)} FROM rows")
         ]
-        used = [dict(one) for (text,) in table.execute("SELECT versions FROM runs") for one in json.loads(text)]
-    return rows, cells, _distinct(used)
+        versions = [dict(v) for (text,) in table.execute("SELECT versions FROM runs") for v in json.loads(text)]
+    return rows, cells, _distinct(versions)
+
+
+def _stored_cell(id: str, text: str, state: State, step: int, speed: float | None) -> tuple[Cell, Progress]:
+    if state not in get_args(State) or type(step) is not int:
+        raise ValueError(f"cell {id} has an invalid state or step")
+    return Cell.from_json(dict(json.loads(text)), id), Progress(state, step, speed)
 
 
 @contextlib.contextmanager
-def _reading(file: Path) -> Iterator[sqlite3.Connection]:
+def _open(file: Path) -> Iterator[sqlite3.Connection]:
+    """Open a table to read it. Errors in the block that come from a damaged table become one DelayRLError."""
     if not file.is_file():
         raise DelayRLError(f"there is no table {file}; `delayrl bench collect GRID` makes one")
     try:
-        with contextlib.closing(sqlite3.connect(f"file:{_quoted(file)}?mode=ro", uri=True)) as table:
+        with contextlib.closing(sqlite3.connect(f"file:{quote(str(file.resolve()))}?mode=ro", uri=True)) as table:
             version = table.execute("SELECT value FROM meta WHERE key = 'schema'").fetchone()
-            if version is None or version[0] != str(SCHEMA):
-                have = version[0] if version else "none"
-                raise DelayRLError(
-                    f"{file} has schema version {have}, this program reads {SCHEMA}: collect it again with this version"
-                )
-            yield table
-    except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
+            if version == (str(SCHEMA),):
+                yield table
+                return
+    except (sqlite3.Error, ValueError, KeyError, TypeError, DelayRLError) as error:
         raise DelayRLError(f"{file} is no table of results, or damaged: {error}") from error
-
-
-def _quoted(file: Path) -> str:
-    from urllib.parse import quote
-
-    return quote(os.fspath(file.resolve()))
+    other = version[0] if version else "none"
+    raise DelayRLError(
+        f"{file} has schema version {other}, this program reads {SCHEMA}: collect it again with this version"
+    )
 
 
 def _json(value: Any) -> str:

@@ -6,98 +6,117 @@ from pathlib import Path
 from statistics import median
 
 from delayrl.bench import folders
-from delayrl.bench.folders import Progress, State
-from delayrl.bench.grid import Cell, Grid
+from delayrl.run.cell import Cell, Progress, State
 
 Standing = Sequence[tuple[Cell, Progress]]
+"""Cells, each with how far it is."""
+HEAD = ("id", "agent", "task", "delay", "seeds", "state", "steps", "steps/s", "time left")
 
 
 def progress(cell: Cell, runs: Path) -> Progress:
-    """How far a cell is."""
-    return folders.progress(runs / cell.folder, cell.seeds)
+    """Read from disk how far a cell is."""
+    folder = runs / cell.folder
+    step, complete = folders.stored(folder, cell.seeds)
+    holder, events = folders.holder(folder), folders.journal(folder)
+    metrics = folders.newest_metrics(folders.seed_folders(folder, cell.seeds)[0])
+    speed = metrics.get("steps_per_second")
+    if holder is not None:
+        return Progress("running", max(step, int(metrics.get("step", 0))), speed, holder)
+    if complete:
+        return Progress("done", step, speed)
+    if events and events[-1]["event"] == "failed":
+        return Progress("failed", step, speed, str(events[-1].get("line", "")))
+    return Progress("todo", step, speed)
 
 
 def status(cell: Cell, runs: Path) -> State:
-    """In one word."""
+    """Read from disk whether a cell is to do, running, done or failed."""
     return progress(cell, runs).state
 
 
 def standing(cells: Sequence[Cell], runs: Path) -> list[tuple[Cell, Progress]]:
-    """How far each cell is."""
+    """Read from disk how far each cell is."""
     return [(cell, progress(cell, runs)) for cell in cells]
 
 
 def seconds_left(standing: Standing, workers: int) -> float | None:
-    """A guess: what is left at the speeds measured until now; None before any was.
+    """Estimate the time left from the speeds measured so far, or return None if there are none yet.
 
-    A cell that has not begun is taken to be as fast as its agent on the same task, else as its agent, else as all.
+    A cell that has not begun is taken to be as fast as the median of the cells most like it that have: the same agent,
+    task and delay, else the same agent and task, else the same agent, else all.
+
+    Args:
+        standing: how far each cell is.
+        workers: how many cells run at a time.
     """
     measured = [(cell, p.speed) for cell, p in standing if p.speed]
-    left = [(cell, cell.steps - p.step, p.speed) for cell, p in standing if p.state in ("todo", "running")]
-    if not left:
+    unfinished = [(cell, p) for cell, p in standing if p.state in ("todo", "running")]
+    if not unfinished:
         return 0.0
     if not measured:
         return None
-    seconds = []
-    for cell, steps, own in left:
-        alike = [
-            [s for c, s in measured if (c.agent, c.env, c.delay) == (cell.agent, cell.env, cell.delay)],
-            [s for c, s in measured if (c.agent, c.env) == (cell.agent, cell.env)],
-            [s for c, s in measured if c.agent == cell.agent],
-            [s for c, s in measured],
-        ]
-        seconds.append(steps / (own or median(next(speeds for speeds in alike if speeds))))
+    seconds = [(cell.condition.steps - p.step) / (p.speed or _speed_like(cell, measured)) for cell, p in unfinished]
     return max(sum(seconds) / workers, max(seconds))
 
 
+def _speed_like(cell: Cell, measured: list[tuple[Cell, float]]) -> float:
+    for names in (("agent", "env", "delay"), ("agent", "env"), ("agent",)):
+        alike = [
+            speed
+            for other, speed in measured
+            if all(getattr(other.condition, name) == getattr(cell.condition, name) for name in names)
+        ]
+        if alike:
+            return median(alike)
+    return median(speed for _, speed in measured)
+
+
 def line(standing: Standing, workers: int) -> str:
-    """A grid in one line."""
+    """Summarise a grid in one line."""
     counts = Counter(p.state for _, p in standing)
-    steps, whole = sum(p.step for _, p in standing), sum(cell.steps for cell, _ in standing)
-    parts = [f"{counts['done']}/{len(standing)} cells", f"{100 * steps / max(whole, 1):.0f} % of the steps"]
+    steps, total = sum(p.step for _, p in standing), sum(cell.condition.steps for cell, _ in standing)
+    parts = [f"{counts['done']}/{len(standing)} cells", f"{100 * steps / max(total, 1):.0f} % of the steps"]
     if counts["failed"]:
         parts.append(f"{counts['failed']} failed")
     left = seconds_left(standing, workers)
     if left:
         parts.append(f"about {duration(left)} left")
-    running = [
-        f"{cell.agent} {cell.env} {100 * p.step // cell.steps} %" for cell, p in standing if p.state == "running"
-    ]
-    return " · ".join([*parts, *([", ".join(running)] if running else [])])
+    running = [(cell.condition, p.step) for cell, p in standing if p.state == "running"]
+    if running:
+        parts.append(", ".join(f"{c.agent} {c.env} {100 * step // c.steps} %" for c, step in running))
+    return " · ".join(parts)
 
 
-def table(grid: Grid, runs: Path, workers: int) -> str:
-    """A grid in full, for `delayrl bench status`."""
-    now = standing(grid.cells, runs)
-    head = ("id", "agent", "task", "delay", "seeds", "state", "steps", "steps/s", "time left")
-    rows = [head]
-    for cell, p in now:
-        left = seconds_left([(cell, p)], 1) if p.state in ("running", "todo") else None
-        seeds = f"{cell.seeds[0]}-{cell.seeds[-1]}" if len(cell.seeds) > 1 else str(cell.seeds[0])
-        steps = f"{p.step:,} / {cell.steps:,}"
-        speed = f"{p.speed:.0f}" if p.speed else ""
+def table(standing: Standing) -> list[list[str]]:
+    """Return one row for each cell, with the columns of HEAD."""
+    rows = []
+    for cell, p in standing:
+        condition, first, last = cell.condition, cell.seeds[0], cell.seeds[-1]
+        left = seconds_left([(cell, p)], 1)
         rows.append(
-            (
+            [
                 cell.id,
-                cell.agent,
-                cell.env,
-                str(cell.label),
-                seeds,
+                condition.agent,
+                condition.env,
+                str(condition.label),
+                f"{first}-{last}" if last > first else str(first),
                 p.state,
-                steps,
-                speed,
+                f"{p.step:,} / {condition.steps:,}",
+                f"{p.speed:.0f}" if p.speed else "",
                 duration(left) if left else "",
-            )
+            ]
         )
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    text = ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-    text += ["", f"{grid.name}: {line(now, workers)}"]
-    text += [f"failed: {cell} ({cell.id}): {p.line}" for cell, p in now if p.state == "failed"]
-    return "\n".join(text)
+    return rows
+
+
+def closing_lines(name: str, standing: Standing, workers: int) -> list[str]:
+    """Return what stands below the table: the grid of this name in one line, then one line for each failure."""
+    failures = [f"failed: {cell} ({cell.id}): {p.line}" for cell, p in standing if p.state == "failed"]
+    return [f"{name}: {line(standing, workers)}", *failures]
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words: 40 s, 12 min, 3 h 20 min, 2 d 5 h."""
+    """Write a time in words: 40 s, 12 min, 3 h 20 min, 2 d 5 h."""
     minutes = round(seconds / 60)
     if seconds < 90:
         return f"{max(1, round(seconds))} s"

@@ -1,7 +1,7 @@
-"""One cell in a process of its own: `python -m delayrl.bench.worker FOLDER [DEVICE]`.
+"""Train one cell in a process of its own: `python -m delayrl.bench.worker FOLDER [DEVICE]`.
 
-It holds the cell's lock, trains, and says on stdout in one line of JSON how that went. It stops at a checkpoint when
-it is sent SIGTERM, and when whoever started it is gone: its stdin is a pipe that closes then.
+The worker locks the cell, trains it, and prints how that ended as one line of JSON. It stops at a checkpoint on
+SIGTERM, or when the process that started it is gone: its stdin is a pipe, which closes then.
 """
 
 import contextlib
@@ -12,24 +12,24 @@ import sys
 import threading
 import traceback
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from delayrl.bench.folders import LockedError, hold, journal, note, seed_folders, stored
-from delayrl.errors import DelayRLError, StoppedError
+from delayrl.errors import DelayRLError, StoppedError, first_line
 
 Kind = Literal["done", "stopped", "failed", "died", "locked"]
 
 
 class Outcome(NamedTuple):
-    """How one try of a cell ended, and the first line of what it said."""
+    """How one try of a cell ended, with the first line of its message."""
 
     kind: Kind
     line: str
 
 
 def main() -> None:
-    """Work on the cell whose folder is given."""
-    answer = os.fdopen(os.dup(1), "w")  # libraries may print; the answer stands alone
+    """Work on the cell whose folder the command line names."""
+    answer = os.fdopen(os.dup(1), "w")  # libraries may print to stdout: that goes to stderr
     os.dup2(2, 1)
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     outcome = work(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)
@@ -37,51 +37,57 @@ def main() -> None:
 
 
 def work(folder: Path, device: str | None = None) -> Outcome:
-    """Hold the cell and train it, or go on with it."""
+    """Lock a cell, then train it or resume it.
+
+    Args:
+        folder: the cell's folder, with its cell.json.
+        device: "cpu" or "gpu"; None leaves the choice to JAX.
+    """
     try:
         with hold(folder):
-            cell = json.loads((folder / "cell.json").read_text())
-            seeds = tuple(cell["seeds"])
-            step, complete = stored(folder, seeds)
-            if complete:
-                if not any(event["event"] == "done" for event in journal(folder)[-1:]):
-                    note(folder, "done")  # its worker was killed before it could say so
-                return Outcome("done", "")
-            from delayrl.run.provenance import versions
-            from delayrl.training.train import train
-
-            try:
-                note(folder, "begun", pid=os.getpid(), step=step, versions=versions())
-                out = folder if len(seeds) > 1 else seed_folders(folder, seeds)[0]
-                train(
-                    cell["agent"],
-                    cell["env"],
-                    cell["delay"],
-                    preset=cell["preset"],
-                    protocol=cell["protocol"],
-                    seed=seeds[0],
-                    seeds=len(seeds),
-                    out=out,
-                    device=device,
-                    progress=False,
-                    **cell["overrides"],
-                )
-                note(folder, "done")
-                return Outcome("done", "")
-            except StoppedError as error:
-                note(folder, "stopped", step=stored(folder, seeds)[0])
-                return Outcome("stopped", str(error))
-            except DelayRLError as error:  # trying again would end in the same way
-                _log(str(error))
-                return Outcome("failed", str(error))
+            return _train(folder, json.loads((folder / "cell.json").read_text()), device)
     except LockedError:
         return Outcome("locked", "another process works on it")
     except DelayRLError as error:
         return Outcome("failed", str(error))
     except Exception as error:
         _log(traceback.format_exc())
-        words = str(error).strip().splitlines()
-        return Outcome("died", f"{type(error).__name__}: {words[0] if words else ''}".rstrip(": "))
+        return Outcome("died", f"{type(error).__name__}: {first_line(error)}")
+
+
+def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
+    seeds = tuple(cell["seeds"])
+    step, complete = stored(folder, seeds)
+    if complete:
+        if not any(event["event"] == "done" for event in journal(folder)[-1:]):
+            note(folder, "done")  # the worker that finished it was killed before it noted that
+        return Outcome("done", "")
+    from delayrl.run.provenance import versions
+    from delayrl.training.train import train
+
+    try:
+        note(folder, "begun", pid=os.getpid(), step=step, versions=versions())
+        train(
+            cell["agent"],
+            cell["env"],
+            cell["delay"],
+            preset=cell["preset"],
+            protocol=cell["protocol"],
+            seed=seeds[0],
+            seeds=len(seeds),
+            out=folder if len(seeds) > 1 else seed_folders(folder, seeds)[0],
+            device=device,
+            progress=False,
+            **cell["overrides"],
+        )
+        note(folder, "done")
+        return Outcome("done", "")
+    except StoppedError as error:
+        note(folder, "stopped", step=stored(folder, seeds)[0])
+        return Outcome("stopped", str(error))
+    except DelayRLError as error:
+        _log(str(error))
+        return Outcome("failed", str(error))
 
 
 def _log(text: str) -> None:

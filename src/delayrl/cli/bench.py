@@ -1,93 +1,94 @@
-"""`delayrl bench`: plan, run, status, collect, report."""
+"""`delayrl bench`: plan, run, status, collect and report a grid."""
 
 import argparse
 import re
-import signal
 import sys
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 from delayrl.bench import folders
-from delayrl.bench.grid import Cell, Grid, load_grid, shipped
-from delayrl.bench.status import Standing, duration, line, standing, status, table
-from delayrl.cli.main import Parser
+from delayrl.bench.grid import Grid, load_grid, shipped
+from delayrl.bench.status import HEAD, Standing, closing_lines, duration, line, standing, status, table
+from delayrl.cli.console import StatusLine, print_table
 from delayrl.errors import DelayRLError
+from delayrl.run.cell import Cell
+from delayrl.training.signals import stop_signal
+
+BACKEND_OPTIONS: dict[str, dict[str, Any]] = {
+    "slurm": {"sbatch": [], "submit": False},
+    "ray": {"address": None, "cpus": 1.0, "gpus": 0.0},
+}
+"""Defaults of the options that only one backend has."""
 
 
-def bench(arguments: list[str]) -> None:
-    """Entry point of `delayrl bench`."""
-    parser = Parser(prog="delayrl bench", description="Run a grid of agents, tasks, delays and seeds.")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the commands on a grid, each with its options."""
+    commands = parser.add_subparsers(dest="action", metavar="COMMAND", required=True)
 
-    def command(name: str, what: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=what, description=what)
-        names = ", ".join(shipped())
-        sub.add_argument("grid", metavar="GRID", help=f"a .toml file, or one of {names}")
-        sub.add_argument(
+    def add_command(name: str, text: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument("grid", metavar="GRID", help=f"a .toml file, or one of {', '.join(shipped())}")
+        command.add_argument(
             "--runs", type=Path, default=Path("runs/bench"), help="folder of the cells (default: runs/bench)"
         )
-        return sub
+        return command
 
-    command("plan", "list the cells of a grid, and which are done")
-    run = command("run", "work on a grid; the same command goes on")
-    run.add_argument("--cells", nargs="+", metavar="ID", help="only these")
-    run.add_argument("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
-    run.add_argument(
-        "--workers", type=int, metavar="N", help="cells at a time (default: half of the cores; one with a GPU)"
+    add_command("plan", "list the cells of a grid, and which are done")
+    run = add_command("run", "run a grid; the same command resumes it")
+    run.set_defaults(**BACKEND_OPTIONS["slurm"], **BACKEND_OPTIONS["ray"])
+    add = run.add_argument
+    add("--cells", nargs="+", metavar="ID", help="only these cells")
+    add("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
+    add("--workers", type=int, metavar="N", help="cells at a time (default: half of the cores; one with a GPU)")
+    add("--time-limit", type=seconds, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")
+    add("--tries", type=int, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)")
+    add("--device", choices=["cpu", "gpu"], help="(default: JAX's choice)")
+    add("--sbatch", action="append", metavar="OPTION", help="slurm: e.g. --sbatch=--partition=gpu")
+    add("--submit", action="store_true", help="slurm: pass the script to sbatch as well")
+    add("--address", help="ray: HOST:PORT of a cluster, or auto (default: a local one)")
+    add("--cpus", type=float, help="ray: cores for each cell (default: 1)")
+    add("--gpus", type=float, help="ray: GPUs for each cell (default: 0)")
+    add_command("status", "show progress, speed, time left and failures").add_argument(
+        "--workers", type=int, default=1, metavar="N", help="cells at a time, for the time left (default: 1)"
     )
-    run.add_argument("--time-limit", type=seconds, metavar="TIME", help="stop at a checkpoint then, e.g. 9m or 1h30m")
-    run.add_argument(
-        "--tries",
-        type=int,
-        default=5,
-        metavar="N",
-        help="times in a row that a cell may die with nothing new (default: 5)",
-    )
-    run.add_argument("--device", choices=["cpu", "gpu"], help="(default: what JAX finds)")
-    run.add_argument(
-        "--sbatch", action="append", default=[], metavar="OPTION", help="slurm: e.g. --sbatch=--partition=gpu"
-    )
-    run.add_argument("--submit", action="store_true", help="slurm: hand the script to sbatch too")
-    run.add_argument("--address", help="ray: HOST:PORT of a cluster, or auto (default: one of its own here)")
-    run.add_argument("--cpus", type=float, default=1.0, help="ray: cores for each cell (default: 1)")
-    run.add_argument("--gpus", type=float, default=0.0, help="ray: GPUs for each cell (default: 0)")
-    command("status", "progress, speed, time left, failures").add_argument(
-        "--workers", type=int, default=1, metavar="N", help="for the time left: cells at a time (default: 1)"
-    )
-    command("collect", "write the rows of a grid into one SQLite table").add_argument(
+    add_command("collect", "write the rows of a grid into one SQLite table").add_argument(
         "--out", type=Path, help="the table (default: GRID.sqlite in the folder of the cells)"
     )
-    command("report", "tables, curves and one HTML page of what is there").add_argument(
+    add_command("report", "write tables, curves and one HTML page of the results so far").add_argument(
         "--out", type=Path, metavar="DIR", help="a folder (default: GRID-report in the folder of the cells)"
     )
-    given = parser.parse_args(arguments)
-    if given.command == "report" and given.grid.endswith(".sqlite"):
-        _report_table(Path(given.grid), given)
+
+
+def run(given: argparse.Namespace) -> None:
+    """Run a command on a grid."""
+    if given.action == "report" and given.grid.endswith(".sqlite"):
+        _report_table(Path(given.grid), given.out)
         return
     grid = load_grid(given.grid)
-    if given.command != "plan":
-        _claim(grid, given, look=True)
-    if given.command == "run":
-        _check_backend(run, given)
-    {"plan": _plan, "run": _run, "status": _status, "collect": _collect, "report": _report}[given.command](grid, given)
+    if given.action != "plan":
+        folders.claim(given.runs, grid, check_only=True)
+    actions = {"plan": _plan, "run": _run, "status": _status, "collect": _collect, "report": _report}
+    actions[given.action](grid, given)
 
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:
     for cell in grid.cells:
-        print(f"{cell.id}  {status(cell, given.runs):<7}  {cell}, preset {cell.preset}, {cell.steps:,} steps")
+        condition = cell.condition
+        text = f"{cell}, preset {condition.preset}, {condition.steps:,} steps"
+        print(f"{cell.id}  {status(cell, given.runs):<7}  {text}")
     runs = sum(len(cell.seeds) for cell in grid.cells)
-    steps = sum(cell.steps * len(cell.seeds) for cell in grid.cells)
+    steps = sum(cell.condition.steps * len(cell.seeds) for cell in grid.cells)
     print(f"\n{grid.name}: {len(grid.cells)} cells, {runs} runs, {steps:,} steps")
-    print(grid.description) if grid.description else None
+    if grid.description:
+        print(grid.description)
 
 
 def _status(grid: Grid, given: argparse.Namespace) -> None:
-    _at_least_one("--workers", given.workers)
-    print(table(grid, given.runs, given.workers))
+    _check_at_least_one("--workers", given.workers)
+    cells = standing(grid.cells, given.runs)
+    print_table(HEAD, table(cells))
+    print("", *closing_lines(grid.name, cells, given.workers), sep="\n")
 
 
 def _collect(grid: Grid, given: argparse.Namespace) -> None:
@@ -103,72 +104,76 @@ def _report(grid: Grid, given: argparse.Namespace) -> None:
     from delayrl.bench.results import rows_of, versions_of
 
     out = given.out or given.runs / f"{grid.name}-report"
-    rows, used = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
-    _write_report(rows, standing(grid.cells, given.runs), out, grid.name, used)
+    rows, versions = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
+    _write_report(rows, standing(grid.cells, given.runs), out, grid.name, versions)
 
 
-def _report_table(table: Path, given: argparse.Namespace) -> None:
+def _report_table(file: Path, out: Path | None) -> None:
     from delayrl.bench.results import read_table
 
-    rows, cells, used = read_table(table)
-    _write_report(rows, cells, given.out or table.with_name(f"{table.stem}-report"), table.stem, used)
+    rows, cells, versions = read_table(file)
+    _write_report(rows, cells, out or file.with_name(f"{file.stem}-report"), file.stem, versions)
 
 
 def _write_report(
     rows: Iterable[dict[str, Any]], cells: Standing, out: Path, title: str, versions: list[dict[str, Any]]
 ) -> None:
     from delayrl.report.report import report
-    from delayrl.report.summary import Cell as Shown
 
-    shown = [
-        Shown(c.id, c.agent, c.env, c.label, c.preset, c.protocol, c.seeds, c.overrides, p.state, p.step, c.steps)
-        for c, p in cells
-    ]
-    print(f"open {report(rows, shown, out, title, versions)}; the same as Markdown lies beside it")
+    page = report(rows, cells, out, title, versions)
+    print(f"open {page}; the same as Markdown is beside it")
 
 
 def _run(grid: Grid, given: argparse.Namespace) -> None:
-    from delayrl.bench.runner import STOPPED, Backend, Local, default_workers, work_off
+    from delayrl.bench.runner import STOPPED, run_cells
 
+    _check_backend(given)
     cells = _chosen(grid, given.cells)
-    _at_least_one("--tries", given.tries)
-    _at_least_one("--workers", given.workers)
-    _claim(grid, given, look=False)
+    _check_at_least_one("--tries", given.tries)
+    _check_at_least_one("--workers", given.workers)
+    folders.claim(given.runs, grid)
     if given.backend == "slurm":
-        _slurm(grid, cells, given)
+        _write_slurm(grid, cells, given)
         return
-    workers = given.workers or default_workers(given.device)
-    backend: Backend = Local(given.runs, workers, given.device)
-    if given.backend == "ray":
-        from delayrl.bench.ray import OnRay
-
-        backend = OnRay(given.runs, given.address, given.workers, given.cpus, given.gpus, given.device)
-        workers = max(1, backend.room())
-    live = _Live(cells, given.runs, workers)
-    with _asked_to_stop() as stop:
-        report = work_off(
+    backend, workers = _backend(given)
+    status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
+    with stop_signal() as stop:
+        completion = run_cells(
             cells,
             given.runs,
             backend,
             tries=given.tries,
             time_limit=given.time_limit,
             stop=stop,
-            say=live.say,
-            tick=live.tick,
+            say=status_line.say,
+            tick=status_line.update,
         )
-    live.end()
-    print(f"{grid.name}: {len(report.done)} of {len(cells)} cells done")
-    if report.failed:
-        first = next(iter(report.failed.values()))
-        count = f"{len(report.failed)} of {len(cells)} cells failed"
-        raise DelayRLError(f"{count}, the first: {first} (`delayrl bench status` has them all)")
-    if report.left:
-        print("stopped at a checkpoint; the same command goes on")
+    status_line.clear()
+    print(f"{grid.name}: {len(completion.done)} of {len(cells)} cells done")
+    if completion.failed:
+        first = next(iter(completion.failed.values()))
+        count = f"{len(completion.failed)} of {len(cells)} cells failed"
+        raise DelayRLError(f"{count}, the first: {first} (`delayrl bench status` lists all)")
+    if completion.unfinished:
+        print("stopped at a checkpoint; the same command resumes it")
         sys.exit(STOPPED)
 
 
-def _slurm(grid: Grid, cells: Sequence[Cell], given: argparse.Namespace) -> None:
-    from delayrl.bench import slurm
+def _backend(given: argparse.Namespace) -> tuple[Any, int]:
+    """Return the backend, and how many cells it runs at a time."""
+    if given.backend == "ray":
+        from delayrl.bench.backends.ray import RayBackend
+
+        ray = RayBackend(given.runs, given.address, given.workers, given.cpus, given.gpus, given.device)
+        return ray, max(1, ray.room())
+    from delayrl.bench.backends.local import LocalBackend, default_workers
+
+    workers = given.workers or default_workers(given.device)
+    return LocalBackend(given.runs, workers, given.device), workers
+
+
+def _write_slurm(grid: Grid, cells: Sequence[Cell], given: argparse.Namespace) -> None:
+    from delayrl.bench.backends import slurm
 
     left = [cell for cell in cells if status(cell, given.runs) != "done"]
     if not left:
@@ -181,84 +186,31 @@ def _slurm(grid: Grid, cells: Sequence[Cell], given: argparse.Namespace) -> None
     print(f"submitted as job {slurm.submit(file)}" if given.submit else f"next: sbatch {file}")
 
 
-def _claim(grid: Grid, given: argparse.Namespace, look: bool) -> None:
-    folders.claim(given.runs, grid.name, grid.source, grid.ids, grid.is_shipped, look)
-
-
 def _chosen(grid: Grid, ids: list[str] | None) -> list[Cell]:
-    if ids is None:
-        return list(grid.cells)
-    for word in ids:
+    for word in ids or ():
         if word not in grid.ids:
             raise DelayRLError(f"{grid.name} has no cell {word}; `delayrl bench plan` lists them")
-    return [cell for cell in grid.cells if cell.id in ids]
+    return [cell for cell in grid.cells if ids is None or cell.id in ids]
 
 
-def _check_backend(run: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    """DelayRLError for an option that the chosen backend does not have: it would be ignored in silence."""
-    for backend, names in {"slurm": ("sbatch", "submit"), "ray": ("address", "cpus", "gpus")}.items():
-        for name in names:
-            if given.backend != backend and getattr(given, name) != run.get_default(name):
+def _check_backend(given: argparse.Namespace) -> None:
+    """Raise DelayRLError for an option of another backend, which would be ignored."""
+    for backend, options in BACKEND_OPTIONS.items():
+        for name, default in options.items():
+            if given.backend != backend and getattr(given, name) != default:
                 raise DelayRLError(f"--{name} needs --backend {backend}; got --backend {given.backend}")
 
 
-def _at_least_one(name: str, value: int | None) -> None:
+def _check_at_least_one(name: str, value: int | None) -> None:
     if value is not None and value < 1:
         raise DelayRLError(f"{name} must be at least 1; got {value}")
 
 
 def seconds(text: str) -> float:
-    """A time such as 90s, 9m, 1h30m or 2d, in seconds."""
-    parts = re.fullmatch(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
+    """Return the seconds of a time such as 90s, 9m, 1h30m or 2d. Raises DelayRLError for another text."""
+    match = re.fullmatch(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
     units = (86400, 3600, 60, 1)
-    total = sum(int(n or 0) * unit for n, unit in zip(parts.groups(), units, strict=True)) if parts else 0
+    total = sum(int(n or 0) * unit for n, unit in zip(match.groups(), units, strict=True)) if match else 0
     if not total:
-        raise DelayRLError(f"a time is written as 90s, 9m, 1h30m or 2d, and is longer than nothing; got {text!r}")
+        raise DelayRLError(f"a time is written as 90s, 9m, 1h30m or 2d, and is above 0; got {text!r}")
     return total
-
-
-@contextmanager
-def _asked_to_stop() -> Iterator[Event]:
-    event = Event()
-    kinds = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(kind, lambda *_: event.set()) for kind in kinds]
-    try:
-        yield event
-    finally:
-        for kind, handler in zip(kinds, before, strict=True):
-            signal.signal(kind, handler)
-
-
-class _Live:
-    """A line on stderr that says where the grid stands: rewritten on a terminal, now and then in a log."""
-
-    def __init__(self, cells: Sequence[Cell], runs: Path, workers: int):
-        self._cells, self._runs, self._workers = cells, runs, workers
-        self._terminal = sys.stderr.isatty()
-        self._every = 1.0 if self._terminal else 30.0
-        self._next, self._began = 0.0, time.monotonic()
-
-    def say(self, text: str) -> None:
-        """A line that stays."""
-        self.end()
-        print(text, file=sys.stderr, flush=True)
-        self._next = 0.0 if self._terminal else self._next
-
-    def tick(self) -> None:
-        """Show where it stands, if it is time."""
-        now = time.monotonic()
-        if now < self._next:
-            return
-        self._next = now + self._every
-        text = f"{duration(now - self._began)}: {line(standing(self._cells, self._runs), self._workers)}"
-        print(
-            f"\r\033[K{text}" if self._terminal else text,
-            end="" if self._terminal else "\n",
-            file=sys.stderr,
-            flush=True,
-        )
-
-    def end(self) -> None:
-        """Remove the line that is rewritten."""
-        if self._terminal:
-            print("\r\033[K", end="", file=sys.stderr, flush=True)

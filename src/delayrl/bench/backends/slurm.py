@@ -1,7 +1,7 @@
-"""Slurm: a grid as an array job.
+"""Slurm: run a grid as an array job.
 
-Each element runs one cell with the local runner. When its time is up, or Slurm asks it to stop, it stores a checkpoint
-and puts itself into the queue again. Slurm does that for an element whose node failed.
+Each element of the array runs one cell with the local backend. When its time is up, or Slurm asks it to stop, it stores
+a checkpoint and requeues itself. Slurm requeues elements whose node failed.
 """
 
 import math
@@ -13,9 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from delayrl.bench import folders
-from delayrl.bench.grid import Cell, Grid
+from delayrl.bench.grid import Grid
 from delayrl.bench.runner import GRACE, STOPPED
 from delayrl.errors import DelayRLError
+from delayrl.run.cell import Cell
+from delayrl.run.disk import disk_errors
 
 HOUR = 3600.0
 
@@ -55,15 +57,18 @@ def script(
     options: Sequence[str] = (),
     arguments: Sequence[str] = (),
 ) -> str:
-    """The text of an sbatch script for the cells.
+    """Return the text of an sbatch script.
 
     Args:
-        grid: where they come from.
-        cells: those to run, one element of the array each.
+        grid: the grid that the cells come from.
+        cells: the cells to run, one for each element of the array.
         runs: the folder of the cells' folders, on a file system that the nodes share.
-        time_limit: seconds that an element may take before it stops and queues again (default: an hour).
-        options: words for `#SBATCH` lines, e.g. "--partition=gpu".
-        arguments: more words for `delayrl bench run`.
+        time_limit: seconds until an element stops and requeues itself (default: an hour).
+        options: options for `#SBATCH` lines, e.g. "--partition=gpu".
+        arguments: more arguments for `delayrl bench run`.
+
+    Raises:
+        DelayRLError: an option that is none.
     """
     source = grid.name if grid.is_shipped else str(grid.source.resolve())
     words = [sys.executable, "-m", "delayrl", "bench", "run", source, "--runs", str(runs.resolve()), *arguments]
@@ -87,23 +92,22 @@ def script(
 
 
 def write(grid: Grid, cells: Sequence[Cell], runs: Path, text: str) -> Path:
-    """Prepare the cells' folders and write the script below `runs`."""
+    """Prepare the cells' folders and write the script. Returns its path, RUNS/slurm/NAME.sbatch."""
     for cell in cells:
         folders.prepare(runs / cell.folder, cell)
     file = runs / "slurm" / f"{grid.name}.sbatch"
-    try:
+    with disk_errors(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
-    except OSError as error:
-        raise DelayRLError(f"cannot write {file}: {error.strerror}") from error
     return file
 
 
 def submit(file: Path) -> str:
-    """Hand a script to Slurm; returns the job's number."""
+    """Submit a script. Returns the job's number. Raises DelayRLError if sbatch is missing or refuses."""
     if shutil.which("sbatch") is None:
-        raise DelayRLError(f"there is no sbatch here; on a machine that has it: sbatch {file}")
+        raise DelayRLError(f"there is no sbatch here; on a machine that has it, run: sbatch {file}")
     done = subprocess.run(["sbatch", "--parsable", str(file)], capture_output=True, text=True)
     if done.returncode:
-        raise DelayRLError(f"sbatch refuses {file}: {(done.stderr.strip() or 'no reason given').splitlines()[0]}")
+        reason = done.stderr.strip().partition("\n")[0] or "no reason given"
+        raise DelayRLError(f"sbatch refuses {file}: {reason}")
     return done.stdout.strip().split(";")[0]

@@ -1,7 +1,7 @@
-"""Ray: an actor for each cell that is worked on, on a cluster that is there, or on a local one.
+"""Ray: one actor for each running cell, on an existing cluster or on a local one.
 
-The actor supervises a worker process as the local backend does, so a node that dies takes its cells' locks with it
-and they are started again elsewhere. All nodes must see the runs' folder, and have delayrl installed.
+The actor starts a worker process, as the local backend does. When a node dies, the locks of its cells are released and
+the cells start again elsewhere. All nodes must share the folder of the runs and have delayrl installed.
 """
 
 import math
@@ -14,31 +14,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from delayrl.bench.grid import Cell
-from delayrl.bench.runner import PAUSE, read_outcome, start_worker
+from delayrl.bench.backends.local import read_outcome, start_worker
+from delayrl.bench.runner import PAUSE
 from delayrl.bench.worker import Outcome
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
+from delayrl.run.cell import Cell
 
-ANSWER = 5.0
-"""Seconds that a Ray address has to answer."""
+TIMEOUT = 5.0
+"""Seconds that a Ray address has to accept a connection."""
 
 
 class Supervisor:
-    """On a node: starts a cell's worker, waits for its end, passes on a wish to stop."""
+    """The actor on a node: starts a cell's worker, waits until it ends, and asks it to stop."""
 
     def __init__(self) -> None:
         self._stop = threading.Event()
 
     def run(self, folder: str, device: str | None) -> tuple[str, str]:
-        """Work on the cell in this folder; how it ended."""
+        """Run the cell in this folder. Returns how it ended."""
         if not (Path(folder) / "cell.json").is_file():
             return Outcome("failed", f"{folder} cannot be seen from {platform.node()}: the nodes must share it")
         process = start_worker(Path(folder), device)
-        asked = False
+        stopping = False
         while process.poll() is None:
-            if self._stop.is_set() and not asked:
+            if self._stop.is_set() and not stopping:
                 process.terminate()
-                asked = True
+                stopping = True
             time.sleep(PAUSE)
         return read_outcome(process)
 
@@ -48,8 +49,17 @@ class Supervisor:
 
 
 @dataclass
-class OnRay:
-    """The Ray backend."""
+class RayBackend:
+    """Runs cells on a Ray cluster.
+
+    Attributes:
+        runs: the folder of the cells' folders.
+        address: HOST:PORT of the cluster, or "auto"; None starts a local one.
+        workers: the most cells at a time; None leaves the limit to the cluster.
+        cpus, gpus: what each cell takes of them.
+        device: "cpu" or "gpu"; None leaves the choice to JAX.
+        running: each running cell with its actor and its pending answer, by cell id.
+    """
 
     runs: Path
     address: str | None = None
@@ -61,35 +71,35 @@ class OnRay:
 
     def __post_init__(self) -> None:
         if not (0 <= self.cpus < math.inf and 0 <= self.gpus < math.inf and self.cpus + self.gpus):
-            raise DelayRLError(f"a cell takes cores, or GPUs; got --cpus {self.cpus:g} --gpus {self.gpus:g}")
+            raise DelayRLError(f"a cell takes cores or GPUs; got --cpus {self.cpus:g} --gpus {self.gpus:g}")
         self._ray = connect(self.address)
         resources = {"num_cpus": self.cpus, "num_gpus": self.gpus}
         self._actor = self._ray.remote(max_concurrency=2, max_restarts=0, **resources)(Supervisor)
         if self.room() < 1:  # waiting would never end
-            have = self._ray.cluster_resources()
+            total = self._ray.cluster_resources()
             self.close()
             raise DelayRLError(
-                f"a cell takes {self.cpus:g} cores and {self.gpus:g} GPUs (--cpus, --gpus), all of this Ray cluster "
-                f"has {have.get('CPU', 0):g} and {have.get('GPU', 0):g}"
+                f"a cell takes {self.cpus:g} cores and {self.gpus:g} GPUs (--cpus, --gpus), but this Ray cluster "
+                f"has {total.get('CPU', 0):g} and {total.get('GPU', 0):g}"
             )
 
     def room(self) -> int:
-        """As many cells as the cluster's cores (and GPUs) hold now, at the most `workers`."""
-        have = self._ray.cluster_resources()
-        limits = [int(have.get("CPU", 0) / self.cpus)] if self.cpus else []
-        limits += [int(have.get("GPU", 0) / self.gpus)] if self.gpus else []
+        """Return how many more cells the cluster's cores and GPUs hold now, `workers` at most."""
+        total = self._ray.cluster_resources()
+        limits = [int(total.get("CPU", 0) / self.cpus)] if self.cpus else []
+        limits += [int(total.get("GPU", 0) / self.gpus)] if self.gpus else []
         limits += [self.workers] if self.workers else []
         return min(limits) - len(self.running)
 
     def start(self, cell: Cell) -> None:
-        """One actor for each cell."""
+        """Start an actor on a cell."""
         actor = self._actor.remote()
         answer = actor.run.remote(str((self.runs / cell.folder).resolve()), self.device)
         self.running[cell.id] = cell, actor, answer
 
     def ended(self) -> list[tuple[Cell, Outcome]]:
-        """Those that answered, and those whose node or actor died."""
-        found = []
+        """Return the cells that answered since the last call, and those whose node or actor died."""
+        ended = []
         answers = {answer: cell for cell, _, answer in self.running.values()}
         ready, _ = self._ray.wait(list(answers), num_returns=len(answers), timeout=0) if answers else ([], [])
         for answer in ready:
@@ -97,19 +107,19 @@ class OnRay:
             try:
                 outcome = Outcome(*self._ray.get(answer))
             except self._ray.exceptions.RayError as error:
-                outcome = Outcome("died", f"{type(error).__name__}: {str(error).strip().splitlines()[0]}")
+                outcome = Outcome("died", f"{type(error).__name__}: {first_line(error)}")
             _, actor, _ = self.running.pop(cell.id)
             self._ray.kill(actor)
-            found.append((cell, outcome))
-        return found
+            ended.append((cell, outcome))
+        return ended
 
     def stop(self) -> None:
-        """Pass the wish on to every actor."""
+        """Ask all running cells to stop at a checkpoint."""
         for _, actor, _ in self.running.values():
             actor.stop.remote()
 
     def close(self) -> None:
-        """Kill what is left; their workers store a checkpoint. A local cluster ends, another is left."""
+        """Kill the actors, on which their workers store a checkpoint, and disconnect. A local cluster ends."""
         for _, actor, _ in self.running.values():
             self._ray.kill(actor)
         self.running.clear()
@@ -117,10 +127,10 @@ class OnRay:
 
 
 def connect(address: str | None) -> Any:
-    """Ray, connected to the cluster at an address, or to one of its own on this machine.
+    """Return the module `ray`, connected to the cluster at an address, or to a new local one.
 
     Raises:
-        DelayRLError: Ray is not installed, or nothing answers.
+        DelayRLError: Ray is not installed, or no cluster answers at the address.
     """
     try:
         import ray
@@ -131,32 +141,32 @@ def connect(address: str | None) -> Any:
     if address is None:
         ray.init(include_dashboard=False, **quiet)
         return ray
-    _knock(address)
-    failed: list[BaseException] = []
+    _check_address(address)
+    errors: list[BaseException] = []
 
     def join() -> None:
         try:
             ray.init(address=address, **quiet)
         except BaseException as error:  # Ray may also call sys.exit
-            failed.append(error)
+            errors.append(error)
 
     thread = threading.Thread(target=join, daemon=True)
     thread.start()
-    thread.join(6 * ANSWER)
-    if failed or thread.is_alive():
-        reason = str(failed[0]).strip().splitlines()[0] if failed and str(failed[0]).strip() else "it does not answer"
+    thread.join(6 * TIMEOUT)
+    if errors or thread.is_alive():
+        reason = first_line(errors[0]) if errors else "it does not answer"
         raise DelayRLError(f"no Ray cluster at {address}: {reason}")
     return ray
 
 
-def _knock(address: str) -> None:
-    """Ray itself would try for minutes."""
+def _check_address(address: str) -> None:
+    """Raise DelayRLError if nothing listens at an address. Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if address == "auto":
         return
     if not host or not port.isdigit():
-        raise DelayRLError(f"--address is HOST:PORT of a Ray cluster, or auto; got {address!r}")
+        raise DelayRLError(f"--address must be HOST:PORT of a Ray cluster, or auto; got {address!r}")
     try:
-        socket.create_connection((host, int(port)), timeout=ANSWER).close()
+        socket.create_connection((host, int(port)), timeout=TIMEOUT).close()
     except OSError as error:
         raise DelayRLError(f"no Ray cluster at {address}: {error.strerror or error}") from error
