@@ -148,9 +148,8 @@ def _gamma(parser: Parser, rest: str) -> DelayLaw:
 
 
 def _gilbert(parser: Parser, rest: str) -> DelayLaw:
-    return laws.gilbert_elliott(
-        *parser.values(rest, parser.steps, parser.steps, parser.probability, parser.probability)
-    )
+    steps, probability = parser.steps, parser.probability
+    return laws.gilbert_elliott(*parser.values(rest, steps, steps, probability, probability))
 
 
 def _walk(parser: Parser, rest: str) -> DelayLaw:

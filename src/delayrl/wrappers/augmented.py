@@ -6,6 +6,7 @@ the age of the action that led to the observation, divided by the longest delay.
 as it is.
 """
 
+from functools import partial
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -66,8 +67,9 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
             raise DelayRLError("AugmentedObservation goes around Delayed: wrap the task in Delayed first")
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
-        self._history, self._delay = env.history, env.delay
         self.observation_space = _augmented_space(env.observation_space, env.action_space, env.history, env.delay)
+        dtype = self.observation_space.dtype
+        self._augment = partial(_augment, history=env.history, delay=env.delay, dtype=dtype)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start an episode."""
@@ -78,9 +80,6 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
         """Issue an action. Returns the augmented state of the next step."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._augment(obs, info), reward, terminated, truncated, info
-
-    def _augment(self, obs: NDArray[Any], info: Info) -> NDArray[Any]:
-        return _augment(obs, info, self._history, self._delay, self.observation_space.dtype)
 
 
 class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
@@ -94,10 +93,10 @@ class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         if not isinstance(env, DelayedVector):
             raise DelayRLError("AugmentedVectorObservation goes around DelayedVector: wrap the tasks in it first")
         super().__init__(env)
-        self._history, self._delay = env.history, env.delay
         single = _augmented_space(env.single_observation_space, env.single_action_space, env.history, env.delay)
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
+        self._augment = partial(_augment, history=env.history, delay=env.delay, dtype=single.dtype)
 
     def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start all episodes."""
@@ -111,6 +110,3 @@ class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
             last = {name: infos["final_info"][name][i] for name in infos["final_info"] if not name.startswith("_")}
             infos["final_obs"][i] = self._augment(infos["final_obs"][i], last)
         return self._augment(obs, infos), rewards, terminated, truncated, infos
-
-    def _augment(self, obs: NDArray[Any], info: Info) -> NDArray[Any]:
-        return _augment(obs, info, self._history, self._delay, self.single_observation_space.dtype)

@@ -17,11 +17,7 @@ Info = dict[str, Any]
 
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
-    """Refuse a task unless its observations are flat and its actions are continuous and bounded.
-
-    Raises:
-        DelayRLError: what is wrong, in one line that starts with `name`.
-    """
+    """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
     if not isinstance(observations, Box):
         raise DelayRLError(f"{name}: observations must be a Box; got {observations}. Flatten them first")
     if len(observations.shape) != 1:

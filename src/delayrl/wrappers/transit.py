@@ -113,13 +113,7 @@ class Transit:
         self.random = np.random.default_rng()
 
     def reset(self, truth: NDArray[Any], seed: int | None = None) -> None:
-        """Start an episode.
-
-        Args:
-            truth: the true first observation, [S].
-            seed: fixes the delays of this episode and of those after it; None to go on with the same random numbers.
-                Delays have a stream of their own, so they do not disturb the environment's randomness.
-        """
+        """Start an episode with the true s_0, [S]. A seed fixes the delays apart from the environment's randomness."""
         if seed is not None:
             self.random = np.random.default_rng([seed, 1])
         self.time, self._end, self.over = 0, None, False
@@ -146,16 +140,9 @@ class Transit:
         return applied
 
     def step(self, truth: NDArray[Any], reward: float, terminated: bool, truncated: bool) -> tuple[float, bool, bool]:
-        """Take in the outcome of a step.
+        """Take in the outcome of a step, and return the reward, termination and truncation that arrive now.
 
-        Args:
-            truth: the true observation; once the episode is `over`, the last one again.
-            reward: what the step earned.
-            terminated: whether the episode has ended.
-            truncated: whether a time limit cuts it off.
-
-        Returns:
-            The reward, termination and truncation that arrive now.
+        Once the episode is `over`, the outcome is the last true observation again, without a reward.
         """
         self.time += 1
         slot = self.time % self._slots
