@@ -15,7 +15,7 @@ LONGEST = 100_000
 def whole_steps(steps: Any) -> int:
     """Check a delay. Raises DelayRLError for anything but a whole number of 0 to `LONGEST` steps."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
-        raise DelayRLError(f"a delay is a whole number of environment steps; got {steps!r}")
+        raise DelayRLError(f"a delay counts whole environment steps; got {steps!r}")
     if steps < 0:
         raise DelayRLError(f"a delay cannot be negative; got {steps:g}")
     if steps > LONGEST:
