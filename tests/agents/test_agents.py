@@ -176,7 +176,7 @@ def test_bfloat16_products_are_close(monkeypatch) -> None:
     rounded = lambda x: x.astype(jnp.bfloat16).astype(jnp.float32)  # noqa: E731
     for module in ("networks", "transformer"):
         monkeypatch.setattr(
-            f"delayrl.{module}.linear",
+            f"delayrl.core.{module}.linear",
             lambda params, x: exact({"w": rounded(params["w"]), "b": params["b"]}, rounded(x)),
         )
     coarse_value, coarse = evaluated()

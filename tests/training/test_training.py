@@ -12,6 +12,7 @@ import pytest
 
 import delayrl
 from delayrl.agents.registry import AGENTS
+from delayrl.core.protocol import OFFICIAL
 from delayrl.delays import as_delay
 from delayrl.envs import make
 from delayrl.play.evaluation import Evaluator, evaluate
@@ -20,6 +21,7 @@ from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
+from delayrl.training.loop import hidden_steps
 from short_runs import arrays, train
 
 
@@ -192,10 +194,11 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
         text = function.trace(*args, **options).lower(lowering_platforms=("cuda",)).as_text()
         lowered.extend(line for line in text.splitlines() if "dot_general" in line)
 
-    def learning(self, learner, stored, keys, steps, due):
-        for index in range(len(self.phases)) if steps[-1] == 100 else ():
-            products(self._jitted_update, learner, stored[-1].hidden, keys, np.int32(1), index=index)
-        return learn(self, learner, stored, keys, steps, due)
+    def learning(self, learner, pending, keys, last, random_steps):
+        hidden = np.stack([stored.hidden for stored in pending[-1]])
+        for index in range(len(self.phases)) if last == 100 else ():
+            products(self._jitted_update, learner, hidden, keys, np.int32(1), index=index)
+        return learn(self, learner, pending, keys, last, random_steps)
 
     def acting(self, agent, seen, keys, step):
         products(self._jitted_act, agent, seen, keys, np.int32(step)) if step == 100 else None
