@@ -1,1 +1,1 @@
-"""From rows to results: conditions, statistics, tables, figures, one page."""
+"""Reports: rows become conditions, results, tables, statistics, figures and one page."""

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from delayrl.report.aggregates import THRESHOLDS, Aggregate
+from delayrl.report.results import Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
-from delayrl.report.summary import THRESHOLDS, Aggregate, Delay, Result, Setting, Summary, agent_order, delay_order
+from delayrl.report.summary import Summary
 
 STYLES = {
     "vdpo": ("#2b63b5", "#7aaeff", ""),
@@ -33,21 +35,25 @@ DASHES = ("5 2", "2 3", "9 2 2 2", "")
 
 
 def styles(labels: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """A style for each label: its agent's own; variants of an agent, and agents of yours, get what is left."""
+    """Choose a style for each label: its agent's own; variants and agents of yours get what is left."""
     left = [(*colour, dash) for dash in DASHES for colour in SPARE]
     chosen: dict[str, tuple[str, str, str]] = {}
     for label in labels:
-        chosen[label] = STYLES[label] if label in STYLES else left[(len(set(chosen) - set(STYLES))) % len(left)]
+        chosen[label] = STYLES.get(label) or left[len(set(chosen) - set(STYLES)) % len(left)]
     return chosen
 
 
 def draw(summary: Summary, out: Path) -> dict[tuple[Setting, str], list[str]]:
-    """Draw everything that there are numbers for. Gives file names by setting and kind: curves, delay, aggregates."""
+    """Draw everything that there are numbers for.
+
+    Returns:
+        File names by setting and kind: curves, delay, aggregates.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
-    looks = {label: (summary.name(label), *style) for label, style in styles(list(summary.labels)).items()}
+    looks = {label: (summary.name(label), *style) for label, style in styles(summary.labels).items()}
     made: dict[tuple[Setting, str], list[str]] = {}
     for number, setting in enumerate(summary.settings):
         results = [r for r in summary.results.values() if r.place.setting == setting and r.runs]
@@ -92,16 +98,15 @@ def _grid(count: int, width: float = 4.0, height: float = 2.9) -> tuple[Any, lis
 def _save(figure: Any, panels: list[Any], path: Path) -> None:
     from matplotlib import pyplot
 
-    found = {
+    lines = {
         label: line
-        for p in panels
-        for line, label in zip(*p.get_legend_handles_labels(), strict=True)
+        for panel in panels
+        for line, label in zip(*panel.get_legend_handles_labels(), strict=True)
         if not label.startswith("_")
     }
-    names = sorted(found, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
-    figure.legend(
-        [found[name] for name in names], names, loc="outside lower center", ncols=5, frameon=False, fontsize=9
-    )
+    names = sorted(lines, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
+    handles = [lines[name] for name in names]
+    figure.legend(handles, names, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
@@ -113,7 +118,7 @@ def _line(look: Look) -> dict[str, Any]:
 
 
 def _plain(text: str) -> str:
-    """A name from the rows: short, no formula, nothing that cannot be drawn."""
+    """Make a name from the rows drawable: short, no formula, no lone surrogates."""
     return text[:60].encode("utf-8", "replace").decode().replace("$", r"\$")
 
 
@@ -123,7 +128,7 @@ def _anchor_lines(axes: Any, result: Result) -> None:
             axes.axhline(anchor.value, **_line(look) | {"linewidth": 1.1})
 
 
-def _curves(results: list[Result], delay: Delay, looks: dict[str, Look], path: Path) -> None:
+def _curves(results: list[Result], delay: int | str, looks: dict[str, Look], path: Path) -> None:
     """Mean over the seeds and standard deviation, a panel for each task."""
     tasks = sorted({r.place.env for r in results})
     figure, panels = _grid(len(tasks))

@@ -6,7 +6,7 @@ reinforcement learning at the edge of the statistical precipice", NeurIPS 2021.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,19 +16,19 @@ NAN = math.nan
 
 
 def mean_std(values: ArrayLike) -> tuple[float, float]:
-    """Mean, and standard deviation with n - 1; NaN where there is no value, or but one."""
+    """Return the mean, and the standard deviation with n - 1; NaN without a value, or with only one."""
     x = np.asarray(values, float)
     return (float(x.mean()) if x.size else NAN), (float(x.std(ddof=1)) if x.size > 1 else NAN)
 
 
 def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
-    """(R - random) / (reference - random), the paper's Ret_nor; NaN unless the reference is better than random."""
+    """Return the paper's Ret_nor, (R - random) / (reference - random); NaN unless reference > random."""
     x = np.asarray(returns, float)
     return (x - random) / (reference - random) if reference > random else np.full(x.shape, NAN)
 
 
 def steps_to_threshold(steps: ArrayLike, returns: ArrayLike, threshold: float) -> Floats:
-    """The first of the steps, [N], at which a curve, [..., N], is at the threshold or above it; NaN where none is."""
+    """Return the first of the steps, [N], at which each curve, [..., N], reaches the threshold; NaN if none does."""
     steps, reached = np.asarray(steps, float), np.asarray(returns, float) >= threshold
     if not steps.size:
         return np.full(reached.shape[:-1], NAN)
@@ -36,7 +36,7 @@ def steps_to_threshold(steps: ArrayLike, returns: ArrayLike, threshold: float) -
 
 
 def interquartile_mean(scores: ArrayLike) -> Floats:
-    """Mean of the middle half of the last axis: a quarter of the scores, rounded down, is cut at either end."""
+    """Average the middle half of the last axis: a quarter of the scores, rounded down, is cut at either end."""
     x = np.sort(np.asarray(scores, float), axis=-1)
     cut = x.shape[-1] // 4
     return x[..., cut : x.shape[-1] - cut].mean(-1)
@@ -49,11 +49,13 @@ def stratified_bootstrap(
     level: float = 0.95,
     seed: int = 0,
 ) -> tuple[Floats, Floats]:
-    """Percentile interval of a statistic of pooled scores. Runs are drawn with replacement within their stratum.
+    """Estimate the percentile interval of a statistic of pooled scores.
+
+    Runs are drawn with replacement within their stratum.
 
     Args:
         strata: scores of each task, at least one in each.
-        statistic: of scores [repetitions, runs], along the last axis; gives [repetitions, ...].
+        statistic: of scores [repetitions, runs], along the last axis; returns [repetitions, ...].
         repetitions: how many times.
         level: of the interval.
         seed: of the draws: the same scores give the same interval.
@@ -73,7 +75,7 @@ def stratified_bootstrap(
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
-    """Fraction of the scores, [..., runs], that lie above each threshold, [T]: [..., T]."""
+    """Return the fraction of the scores, [..., runs], above each threshold, [T], as [..., T]."""
     x, thresholds = np.sort(np.asarray(scores, float), axis=-1), np.asarray(thresholds, float)
     if not x.shape[-1]:
         return np.full((*x.shape[:-1], thresholds.size), NAN)
@@ -82,10 +84,16 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
     return (above / x.shape[-1]).reshape(*x.shape[:-1], thresholds.size)
 
 
-def common_steps(runs: Sequence[tuple[Sequence[int], Sequence[float]]]) -> tuple[NDArray[np.int64], Floats]:
-    """Curves on the steps that every run has: steps [N], returns [runs, N]. A mean never changes its company."""
+def common_steps(runs: Sequence[Mapping[int, float]]) -> tuple[NDArray[np.int64], Floats]:
+    """Align runs on the steps that all of them have, so that every mean is over the same runs.
+
+    Args:
+        runs: returns by step.
+
+    Returns:
+        Steps [N], in order, and returns [runs, N].
+    """
     if not runs:
         return np.zeros(0, np.int64), np.zeros((0, 0))
-    steps = sorted(set(runs[0][0]).intersection(*(points for points, _ in runs[1:])))
-    curves = [dict(zip(points, returns, strict=True)) for points, returns in runs]
-    return np.array(steps, np.int64), np.array([[curve[step] for step in steps] for curve in curves], float)
+    steps = sorted(set(runs[0]).intersection(*runs[1:]))
+    return np.array(steps, np.int64), np.array([[run[step] for step in steps] for run in runs], float)

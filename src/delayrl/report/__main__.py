@@ -1,0 +1,25 @@
+"""Write a report of files of rows: `python -m delayrl.report ROWS --out DIR`."""
+
+import argparse
+from pathlib import Path
+
+from delayrl.errors import DelayRLError
+from delayrl.report.report import report
+from delayrl.report.rows import read_rows
+
+
+def main() -> None:
+    """Write a report of files of rows."""
+    parser = argparse.ArgumentParser(prog="python -m delayrl.report", description=main.__doc__)
+    parser.add_argument("rows", type=Path, nargs="+", help="files of rows, one JSON object a line")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
+    parser.add_argument("--title", default="delayrl", help="title of the report (default: delayrl)")
+    given = parser.parse_args()
+    try:
+        print(report(read_rows(given.rows), [], given.out, given.title))
+    except DelayRLError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""The report as Markdown with pictures. Text from rows and grids is data, and escaped."""
+
+import html
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from delayrl.report import wording
+from delayrl.report.aggregates import Aggregate
+from delayrl.report.results import Result, Setting, agent_order
+from delayrl.report.statistics import mean_std
+from delayrl.report.summary import Summary
+from delayrl.report.tables import Table
+
+
+def markdown(
+    summary: Summary,
+    title: str,
+    pictures: Mapping[tuple[Setting, str], list[str]],
+    versions: Sequence[Mapping[str, Any]] = (),
+) -> str:
+    """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
+    parts = [
+        f"# {_escape(title)}",
+        f"{wording.states(summary)}. † reads the true state while it trains. ± is the standard deviation over seeds. "
+        f"{wording.PAPER}",
+    ]
+    if summary.unplaced:
+        parts.append(f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out.")
+    parts += [_escape(line) for line in wording.overrides(summary)]
+    parts += [_escape(line) for line in wording.made_with(versions)]
+    for setting in summary.settings:
+        results = [r for r in summary.results.values() if r.place.setting == setting]
+        protocol, preset = _escape(setting.protocol), _escape(setting.preset)
+        parts.append(f"## Protocol {protocol}, preset {preset}, {wording.seeds(results)}")
+        for table in summary.tables:
+            if table.setting == setting:
+                parts += [f"### {_escape(table.title)}", _paper_table(summary, table), wording.source(table)]
+        aggregates = [a for a in summary.aggregates if a.setting == setting]
+        if aggregates:
+            parts += ["### Interquartile mean of the normalised return over tasks", _aggregates(summary, aggregates)]
+        for kind, name in (
+            ("aggregates", "Interquartile means and performance profiles"),
+            ("curves", "Learning curves"),
+            ("delay", "Return against delay"),
+        ):
+            files = pictures.get((setting, kind), [])
+            if files and kind != "aggregates":
+                parts.append(f"### {name}")
+            parts += [f"![{name}](img/{file})" for file in files]
+        parts += ["### Anchors", _anchors(results), "### All cells", _results(summary, results)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _escape(text: object) -> str:
+    """Make text that Markdown and its tables take literally."""
+    plain = html.escape(" ".join(str(text).split()), quote=False)
+    return re.sub(r"([\\`*_\[\]|~$#!])", r"\\\1", plain)
+
+
+def _table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---" for _ in head], *body))
+
+
+def _grey(text: str) -> str:
+    return f'<span style="color:#888">{text}</span>'
+
+
+def _paper_table(summary: Summary, table: Table) -> str:
+    body = []
+    for env, delay in table.rows:
+        line = [_escape(env), _escape(delay)]
+        for column in table.columns:
+            ours, raw, note, theirs = wording.entry_texts(table, table.entries[env, delay, column])
+            parts = [f"**{ours}**" if ours else "", f"raw {raw}" if raw else "", _escape(note)]
+            line.append("<br>".join(p for p in [*parts, _grey(f"paper {theirs}") if theirs else ""] if p))
+        body.append(line)
+    return _table(["Task", "Δ", *(_escape(summary.name(column)) for column in table.columns)], body)
+
+
+def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
+    by_place = {(a.delay, a.label): a for a in aggregates}
+    labels = sorted({a.label for a in aggregates}, key=agent_order)
+    body = []
+    for delay in dict.fromkeys(a.delay for a in aggregates):
+        line = ["all constant" if delay is None else _escape(delay)]
+        for label in labels:
+            a = by_place.get((delay, label))
+            if a is None:
+                line.append("")
+                continue
+            interval = "" if math.isnan(a.low) else f"<br>{a.low:.2f} to {a.high:.2f}"
+            tasks = wording.count(a.tasks, "condition" if delay is None else "task")
+            counts = _grey(f"{tasks}, {wording.count(a.runs, 'run')}")
+            line.append(f"**{a.iqm:.2f}**{interval}<br>{counts}")
+        body.append(line)
+    return _table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
+
+
+def _anchors(results: Iterable[Result]) -> str:
+    body = {}
+    for r in results:
+        anchors = (r.random_anchor, r.reference_anchor)
+        values = [f"{wording.number(a.value)} ({wording.count(a.runs, 'seed')})" if a.runs else "none" for a in anchors]
+        key = r.place.env, r.condition.steps
+        body[key] = (_escape(r.place.env), f"{r.condition.steps:,}", *values, _escape(r.reference_anchor.source))
+    return _table(("Task", "Steps", "Random", "Ret_df", "Ret_df is the return of"), body.values())
+
+
+def _results(summary: Summary, results: Iterable[Result]) -> str:
+    body = [
+        (
+            _escape(r.place.env),
+            _escape(r.place.delay),
+            _escape(summary.name(r.place.label)),
+            wording.spread(*mean_std(r.curves.final)),
+            wording.spread(*mean_std(r.normalise(r.curves.final)), wording.normalised),
+            f"{r.runs}/{r.seeds}",
+            f"{r.condition.steps:,}",
+            r.unfinished or r.progress.state,
+        )
+        for r in results
+    ]
+    return _table(("Task", "Δ", "Agent", "Return", "Normalised", "Seeds", "Steps", "State"), body)

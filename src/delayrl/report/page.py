@@ -1,0 +1,172 @@
+"""The report as one HTML page that needs no network.
+
+Text from rows and grids is data, and escaped. The page's policy lets no other script run than its own.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import Any, NamedTuple
+
+from delayrl.report import figures, wording
+from delayrl.report.aggregates import THRESHOLDS, Aggregate
+from delayrl.report.results import Anchor, Result, Setting, agent_order, delay_order
+from delayrl.report.statistics import mean_std
+from delayrl.report.summary import Summary
+from delayrl.report.tables import Table
+
+
+def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Write the page: the template with title and data, and a policy that allows its own script alone."""
+    template = resources.files("delayrl.report").joinpath("report.html").read_text("utf-8")
+    script = template.split("<script>")[1].split("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    data = json.dumps(payload(summary, title, versions), separators=(",", ":"), allow_nan=False)
+    for sign in "<>&\u2028\u2029":  # none of them can end the data's element, or begin another
+        data = data.replace(sign, f"\\u{ord(sign):04x}")
+    values = {"title": html.escape(title), "digest": digest, "data": data}
+    return re.sub(r"\{\{(title|digest|data)\}\}", lambda match: values[match[1]], template)
+
+
+class _Names(NamedTuple):
+    """Lists into which the page's data holds indices; anchors by setting, task and steps."""
+
+    settings: list[Setting]
+    tasks: list[str]
+    delays: list[int | str]
+    agents: list[str]
+    anchors: list[tuple[Setting, str, int]]
+
+
+def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
+    """Return what the page draws: plain lists, numbers and texts."""
+    results = list(summary.results.values())
+    anchored: dict[tuple[Setting, str, int], Result] = {}
+    for result in results:
+        anchored.setdefault(_anchor_key(result), result)
+    names = _Names(
+        summary.settings,
+        sorted({r.place.env for r in results}),
+        sorted({r.place.delay for r in results}, key=delay_order),
+        sorted({*summary.labels, *(c for t in summary.tables for c in t.columns)}, key=agent_order),
+        list(anchored),
+    )
+    styles = figures.styles(names.agents)
+    notes = wording.overrides(summary) + wording.made_with(versions)
+    if summary.unplaced:
+        notes.append(f"{summary.unplaced:,} rows belong to no cell of the grid; left out.")
+    return {
+        "title": title,
+        "state": wording.states(summary),
+        "counts": Counter(r.progress.state for r in results),
+        "notes": notes,
+        "paper": wording.PAPER.replace("`", ""),
+        "settings": [
+            {
+                "protocol": s.protocol,
+                "preset": s.preset,
+                "seeds": wording.seeds(r for r in results if r.place.setting == s),
+            }
+            for s in names.settings
+        ],
+        "tasks": names.tasks,
+        "delays": names.delays,
+        "agents": [{"label": label, "name": summary.name(label), "style": styles[label]} for label in names.agents],
+        "results": [_result(r, names) for r in results],
+        "anchors": [_anchors(r, names) for r in anchored.values()],
+        "tables": [_table(t, names) for t in summary.tables],
+        "thresholds": _rounded(THRESHOLDS),
+        "aggregates": [_aggregate(a, names) for a in summary.aggregates],
+    }
+
+
+def _rounded(value: Any, digits: int = 12) -> Any:
+    """Round to what JSON can hold: lists and numbers, whole numbers as integers, NaN as null.
+
+    Five digits are enough for curves. Numbers that the page writes are rounded there, and not twice.
+    """
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    if hasattr(value, "tolist"):
+        return _rounded(value.tolist(), digits)
+    return [_rounded(x, digits) for x in value] if isinstance(value, list | tuple) else value
+
+
+def _result(r: Result, names: _Names) -> dict[str, Any]:
+    curves = r.curves
+    return {
+        "setting": names.settings.index(r.place.setting),
+        "task": names.tasks.index(r.place.env),
+        "delay": names.delays.index(r.place.delay),
+        "agent": names.agents.index(r.place.label),
+        "status": r.progress.state,
+        "progress": r.unfinished or r.progress.state,
+        "running": r.progress.state == "running",
+        "partial": r.partial,
+        "isAnchor": r.is_anchor,
+        "runs": r.runs,
+        "seeds": r.seeds,
+        "total": r.condition.steps,
+        "raw": _rounded(mean_std(curves.final)),
+        "normalised": _rounded(mean_std(r.normalise(curves.final))),
+        "reached": [_rounded(r.steps_to_threshold), r.seeds_at_threshold],
+        "anchor": names.anchors.index(_anchor_key(r)),
+        "steps": curves.steps.tolist(),
+        "mean": _rounded(curves.mean, 5) if r.runs else [],
+        "std": _rounded(curves.returns.std(0, ddof=1), 5) if r.runs > 1 else [],
+        "each": _rounded(curves.returns, 5) if r.runs > 1 else [],
+    }
+
+
+def _anchor_key(r: Result) -> tuple[Setting, str, int]:
+    return r.place.setting, r.place.env, r.condition.steps
+
+
+def _anchors(r: Result, names: _Names) -> dict[str, Any]:
+    return {
+        "setting": names.settings.index(r.place.setting),
+        "task": names.tasks.index(r.place.env),
+        "total": r.condition.steps,
+        "random": _anchor(r.random_anchor),
+        "reference": _anchor(r.reference_anchor),
+    }
+
+
+def _anchor(anchor: Anchor) -> dict[str, Any]:
+    return {"value": _rounded(anchor.value), "runs": anchor.runs, "source": anchor.source}
+
+
+def _table(table: Table, names: _Names) -> dict[str, Any]:
+    rows = []
+    for env, delay in table.rows:
+        entries = [table.entries[env, delay, column] for column in table.columns]
+        texts = [[_rounded(e.value), e.partial, *wording.entry_texts(table, e)] for e in entries]
+        rows.append([names.tasks.index(env), names.delays.index(delay), texts])
+    return {
+        "kind": table.kind,
+        "title": table.title,
+        "source": wording.source(table),
+        "setting": names.settings.index(table.setting),
+        "columns": [names.agents.index(column) for column in table.columns],
+        "rows": rows,
+    }
+
+
+def _aggregate(a: Aggregate, names: _Names) -> dict[str, Any]:
+    return {
+        "setting": names.settings.index(a.setting),
+        "delay": None if a.delay is None else names.delays.index(a.delay),
+        "agent": names.agents.index(a.label),
+        "iqm": _rounded([a.iqm, a.low, a.high]),
+        "tasks": a.tasks,
+        "runs": a.runs,
+        "profile": _rounded([a.profile, a.profile_low, a.profile_high], 5),
+    }

@@ -1,0 +1,249 @@
+"""Results: one for each condition, from the cells and rows of all its seeds, with the anchors of its task."""
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delayrl.report import statistics
+from delayrl.report.cells import Standing
+from delayrl.report.rows import RowGroup
+from delayrl.report.statistics import NAN, Floats
+from delayrl.run.cell import Cell, Progress, State
+from delayrl.run.condition import Condition
+
+PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
+"""Columns of the paper's tables."""
+
+
+class Curves(NamedTuple):
+    """Mean return of each evaluation: steps [N], returns [runs, N]."""
+
+    steps: NDArray[np.int64]
+    returns: Floats
+
+    @property
+    def mean(self) -> Floats:
+        """Over the runs, [N]."""
+        return self.returns.mean(0)
+
+    @property
+    def final(self) -> Floats:
+        """Of the last evaluation, [runs]."""
+        return self.returns[:, -1] if self.steps.size else np.zeros(0)
+
+
+NO_CURVES = Curves(*statistics.common_steps([]))
+
+
+class Anchor(NamedTuple):
+    """A return that others are measured by.
+
+    Attributes:
+        value: NaN if there is none.
+        runs: how many the value is from.
+        source: the agent that it is the return of.
+        curves: of those runs.
+        inside: whether it is of a reference inside another agent, because there is no delay-free SAC.
+    """
+
+    value: float = NAN
+    runs: int = 0
+    source: str = ""
+    curves: Curves = NO_CURVES
+    inside: bool = False
+
+
+NO_ANCHOR = Anchor()
+
+
+class Setting(NamedTuple):
+    """What must agree before numbers stand in one table."""
+
+    protocol: str
+    preset: str
+
+
+class Place(NamedTuple):
+    """Where a number stands in the tables: row (env, delay), column (label)."""
+
+    setting: Setting
+    env: str
+    delay: int | str
+    label: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """All seeds of one condition.
+
+    Attributes:
+        place: row and column; the label is the agent, with what tells it from the agent's other cells.
+        condition: what was trained; its steps are those at which training ends.
+        progress: of several cells the worst state, and the least step of the cells in that state.
+        seeds: how many are to be run.
+        partial: no seed has reached its last step, so that the numbers are those of the steps so far.
+        privileged: whether its behaviour reads the true state while it trains.
+        curves: of the complete seeds; where there is none yet, of all.
+        reference: the same of its delay-free reference, where it has one.
+        random_anchor, reference_anchor: what its returns are normalised by.
+    """
+
+    place: Place
+    condition: Condition
+    progress: Progress
+    seeds: int
+    partial: bool = True
+    privileged: bool = False
+    curves: Curves = NO_CURVES
+    reference: Curves = NO_CURVES
+    random_anchor: Anchor = NO_ANCHOR
+    reference_anchor: Anchor = NO_ANCHOR
+
+    @property
+    def runs(self) -> int:
+        """Seeds that the numbers are from."""
+        return self.curves.returns.shape[0] if self.curves.steps.size else 0
+
+    @property
+    def is_anchor(self) -> bool:
+        """Whether it stands beside the tables: the random policy, and delay-free SAC."""
+        return self.condition.agent == "random" or (self.condition.agent == "sac" and self.place.delay == 0)
+
+    def normalise(self, returns: Floats) -> Floats:
+        """Return Ret_nor of raw returns of this task."""
+        return statistics.normalised(returns, self.random_anchor.value, self.reference_anchor.value)
+
+    @property
+    def unfinished(self) -> str:
+        """How far it is, if it has not ended; else empty."""
+        state = self.progress.state
+        if state == "failed" or (self.partial and self.runs):
+            word = "failed at" if state == "failed" else "at"
+            seen = self.curves.steps[-1:].tolist() if self.partial else []  # else those are of seeds that have ended
+            return f"{word} {max([self.progress.step, *seen]):,} of {self.condition.steps:,} steps"
+        return state if state == "running" else ""
+
+    @property
+    def steps_to_threshold(self) -> float:
+        """The step at which the mean over the seeds first reaches Ret_df; NaN if it does not, or without Ret_df."""
+        if not self.runs:
+            return NAN
+        curve = self.curves
+        return float(statistics.steps_to_threshold(curve.steps, curve.mean, self.reference_anchor.value))
+
+    @property
+    def seeds_at_threshold(self) -> int:
+        """How many seeds reach Ret_df, each for itself."""
+        if not self.runs or math.isnan(self.reference_anchor.value):
+            return 0
+        return int((self.curves.returns >= self.reference_anchor.value).any(-1).sum())
+
+
+def agent_order(label: str) -> tuple[int, str]:
+    """Sort labels: the paper's columns in the paper's order, then others, the anchors last."""
+    agent = label.split(" ")[0]
+    known = [*PAPER_ORDER, None, "sac-memoryless", "sac", "random"]
+    return known.index(agent) if agent in known else known.index(None), label
+
+
+def delay_order(delay: int | str) -> tuple[bool, int, str]:
+    """Sort delays: constant ones by length, then the others by name."""
+    return (True, 0, delay) if isinstance(delay, str) else (False, delay, "")
+
+
+def make_results(
+    standing: Standing, groups_of: Mapping[str, Sequence[RowGroup]], labels: Mapping[str, str]
+) -> dict[Place, Result]:
+    """Make one result of the cells that differ in nothing but their seeds, with its anchors.
+
+    Args:
+        standing: the cells and how far they are.
+        groups_of: rows by the cell's id.
+        labels: by the cell's id.
+    """
+    members: dict[Place, list[tuple[Cell, Progress]]] = defaultdict(list)
+    for cell, progress in sorted(standing, key=lambda item: item[0].id):
+        condition = cell.condition
+        setting = Setting(condition.protocol, condition.preset)
+        place = Place(setting, condition.env, condition.label, labels[cell.id])
+        if any(set(other.seeds) & set(cell.seeds) for other, _ in members[place]):  # not a part of it: another one
+            place = place._replace(label=f"{place.label} #{cell.id[:8]}")
+        members[place].append((cell, progress))
+    results = [
+        _result(place, group, [rows for cell, _ in group for rows in groups_of[cell.id]])
+        for place, group in members.items()
+    ]
+    return {result.place: _anchored(result, results) for result in sorted(results, key=_order)}
+
+
+def _order(result: Result) -> tuple[Any, ...]:
+    place = result.place
+    return place.setting, place.env, delay_order(place.delay), agent_order(place.label)
+
+
+def _result(place: Place, standing: Standing, groups: Sequence[RowGroup]) -> Result:
+    """Complete seeds count; until there is one, all of them count as partial."""
+    runs = {seed: run for group in groups for seed, run in group.runs("agent").items()}
+    steps = max(cell.condition.steps for cell, _ in standing) or max((max(run) for run in runs.values()), default=0)
+    complete = {seed for seed, run in runs.items() if max(run) >= steps}
+    kept = complete or set(runs)
+    reference = {seed: run for group in groups for seed, run in group.runs("reference").items() if seed in kept}
+    state = _state({progress.state for _, progress in standing}, bool(runs))
+    step = min(
+        [progress.step for _, progress in standing if progress.state == state]
+        or [progress.step for _, progress in standing]
+    )
+    return Result(
+        place,
+        replace(standing[0][0].condition, steps=steps),
+        Progress(state, step),
+        len({seed for cell, _ in standing for seed in cell.seeds} | set(runs)),
+        not complete,
+        any(group.privileged for group in groups),
+        Curves(*statistics.common_steps([runs[seed] for seed in sorted(kept)])),
+        Curves(*statistics.common_steps([reference[seed] for seed in sorted(reference)])),
+    )
+
+
+def _state(states: set[State], has_rows: bool) -> State:
+    """The worst of several cells' states. Some seeds done and others not is running."""
+    if "failed" in states:
+        return "failed"
+    if states == {"done"}:
+        return "done"
+    return "running" if "running" in states or has_rows else "todo"
+
+
+def _anchored(result: Result, others: Sequence[Result]) -> Result:
+    """With the anchors of its task: same protocol and preset; the reference has trained for as many steps."""
+    setting, env = result.place.setting, result.place.env
+    near = [o for o in others if o.place.setting.protocol == setting.protocol and o.place.env == env and o.runs]
+    random = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
+    ended = [o for o in near if o.place.setting == setting and not o.partial]
+    trained = [o for o in ended if o.condition.steps == result.condition.steps]
+    plain = [o for o in trained if o.condition.agent == "sac" and o.place.delay == 0]
+    inside = [o for o in trained if o.reference.steps.size]
+    random_anchor = reference_anchor = NO_ANCHOR
+    if random:  # it does not learn, so that all its evaluations are alike
+        best = min(random, key=_fewest_overrides)
+        random_anchor = Anchor(float(best.curves.returns.mean()), best.runs, "random", best.curves)
+    if plain:
+        best = min(plain, key=_fewest_overrides)
+        name = f"{best.place.label}, no delay"
+        reference_anchor = Anchor(float(best.curves.final.mean()), best.runs, name, best.curves)
+    elif inside:
+        first = ("vdpo", "lifting")
+        best = min(inside, key=lambda o: ([o.condition.agent != name for name in first], _fewest_overrides(o)))
+        name = f"the reference inside {best.place.label}, Δ={best.place.delay}"
+        curves = best.reference
+        reference_anchor = Anchor(float(curves.final.mean()), curves.returns.shape[0], name, curves, True)
+    return replace(result, random_anchor=random_anchor, reference_anchor=reference_anchor)
+
+
+def _fewest_overrides(result: Result) -> tuple[Any, ...]:
+    return len(result.condition.overrides), _order(result)

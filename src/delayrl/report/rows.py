@@ -1,0 +1,124 @@
+"""Rows: read from files, checked, and summed up by cell, policy, seed and step."""
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from delayrl.errors import DelayRLError
+from delayrl.run.condition import Condition
+from delayrl.run.rows import Row
+
+CONDITION_COLUMNS = tuple(Condition("", "", 0).columns)
+LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
+
+
+@dataclass(slots=True)
+class Evaluation:
+    """Returns of one policy at one step of a run: their sum, and the episodes that it is of."""
+
+    total: float = 0.0
+    episodes: set[int] = field(default_factory=set)
+
+
+@dataclass
+class RowGroup:
+    """The rows that name the same cell and the same condition.
+
+    Attributes:
+        cell: the id of the cell; None if the rows name no cell.
+        condition: what the rows say of it; they do not name overrides and steps.
+        privileged: whether the agent's behaviour reads the true state while it trains.
+        curves: evaluations by (policy, seed), then by step.
+    """
+
+    cell: str | None
+    condition: Condition
+    privileged: bool
+    curves: dict[tuple[str, int], dict[int, Evaluation]] = field(
+        default_factory=lambda: defaultdict(lambda: defaultdict(Evaluation))
+    )
+
+    @property
+    def rows(self) -> int:
+        """How many rows the group has."""
+        return sum(len(evaluation.episodes) for curve in self.curves.values() for evaluation in curve.values())
+
+    def runs(self, policy: str) -> dict[int, dict[int, float]]:
+        """Return the mean return of a policy by seed and step."""
+        return {
+            seed: {step: evaluation.total / len(evaluation.episodes) for step, evaluation in curve.items()}
+            for (name, seed), curve in self.curves.items()
+            if name == policy
+        }
+
+
+def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
+    """Check rows and sum them up, in one pass.
+
+    Raises:
+        DelayRLError: a row lacks a column, holds a value of another type, or is there twice.
+    """
+    groups: dict[tuple[Any, ...], RowGroup] = {}
+    columns = itemgetter(*CONDITION_COLUMNS, "seed", "step", "policy", "episode", "return")
+    for number, row in enumerate(rows, 1):
+        try:
+            *condition, seed, step, policy, episode, value = columns(row)
+            key = (row.get("cell"), *condition)
+            if not (type(seed) is type(step) is type(episode) is int and 0 <= step < LIMIT and episode >= 0):
+                raise TypeError
+            if not math.isfinite(value):
+                raise ValueError
+            if key not in groups:
+                groups[key] = _group(row)
+            evaluation = groups[key].curves[policy, seed][step]
+        except KeyError as error:
+            raise DelayRLError(f"row {number} of the results has no column {error}") from None
+        except (TypeError, ValueError, OverflowError, AttributeError, DelayRLError):
+            raise DelayRLError(f"row {number} of the results is damaged: {str(row)[:200]}") from None
+        if episode in evaluation.episodes:
+            raise DelayRLError(
+                f"row {number} of the results is there twice: {groups[key].condition}, seed {seed}, step {step}, "
+                f"episode {episode}; give every file of rows once"
+            )
+        evaluation.total += value
+        evaluation.episodes.add(episode)
+    return list(groups.values())
+
+
+def _group(row: Mapping[str, Any]) -> RowGroup:
+    condition = Condition.from_json({name: row[name] for name in CONDITION_COLUMNS} | {"overrides": {}, "steps": 0})
+    if isinstance(condition.delay, int) and abs(condition.delay) >= LIMIT:
+        raise ValueError
+    cell = row.get("cell")
+    return RowGroup(None if cell is None else str(cell), condition, row.get("privileged") is True)
+
+
+def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
+    """Yield the rows of rows.jsonl files, and of files that `benchmarks/collect.py` wrote.
+
+    Raises:
+        DelayRLError: a file cannot be read, or a line is not a row.
+    """
+    for path in paths:
+        configs: dict[Any, Row] = {}
+        try:
+            with open(path, "rb") as file:
+                for number, line in enumerate(file, 1):
+                    try:
+                        row = json.loads(line)
+                        if not isinstance(row, dict):
+                            raise TypeError
+                        if "config" in row:
+                            names = (*CONDITION_COLUMNS, "privileged", "seed")
+                            configs[row["run"]] = {name: row["config"][name] for name in names}
+                        elif "step" in row:
+                            yield configs.get(row.get("run"), {}) | row
+                    except (ValueError, TypeError, KeyError, RecursionError):
+                        raise DelayRLError(f"{path}, line {number}: this is no row of results") from None
+        except OSError as error:
+            raise DelayRLError(f"{path} cannot be read: {error.strerror}") from error

@@ -1,0 +1,151 @@
+"""Tables in the paper's layout: which rows and columns, and what stands in them."""
+
+import csv
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Literal, NamedTuple
+
+from delayrl.report import statistics
+from delayrl.report.results import PAPER_ORDER, Place, Result, Setting, agent_order, delay_order
+from delayrl.report.statistics import NAN
+
+Kind = Literal["normalised", "steps", "ablation", "stochastic"]
+
+
+class PublishedValue(NamedTuple):
+    """A number of the paper, and its table; `value` is NaN where the paper says the threshold was not reached."""
+
+    table: str
+    value: float
+    std: float
+
+
+@cache
+def published_values() -> dict[tuple[str, ...], PublishedValue]:
+    """Read the paper's values by (measure, task, delay, agent, representation); the last is "" outside the ablation."""
+    lines = resources.files("delayrl.report").joinpath("paper.csv").read_text("utf-8").splitlines()
+    columns = ("measure", "task", "delay", "agent", "representation")
+    return {
+        tuple(row[column] for column in columns): PublishedValue(
+            row["table"], float(row["value"] or "nan"), float(row["std"] or "nan")
+        )
+        for row in csv.DictReader(line for line in lines if not line.startswith("#"))
+    }
+
+
+class TableEntry(NamedTuple):
+    """What stands in a row and a column. Numbers are NaN where there are none.
+
+    Attributes:
+        value, std: a normalised return, or a number of steps.
+        raw, raw_std: the raw return beside it.
+        missed: training has ended and the threshold was not reached.
+        partial: no seed has reached its last step.
+        note: what else must be known of the value.
+        published: the paper's value.
+    """
+
+    value: float = NAN
+    std: float = NAN
+    raw: float = NAN
+    raw_std: float = NAN
+    missed: bool = False
+    partial: bool = False
+    note: str = ""
+    published: PublishedValue | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: rows of (env, delay), columns of labels, and an entry for each (env, delay, label)."""
+
+    kind: Kind
+    title: str
+    setting: Setting
+    rows: list[tuple[str, int | str]]
+    columns: list[str]
+    entries: dict[tuple[str, int | str, str], TableEntry]
+
+
+def make_tables(results: Mapping[Place, Result]) -> list[Table]:
+    """Make the paper's tables, as far as the results reach."""
+    tables = []
+    for setting in sorted({place.setting for place in results}):
+        learners = [r for r in results.values() if r.place.setting == setting and not r.is_anchor]
+        labels: dict[str, set[str]] = defaultdict(set)
+        for result in learners:
+            labels[result.condition.agent].add(result.place.label)
+        varied = sorted(agent for agent, names in labels.items() if len(names) > 1)
+        main = [r for r in learners if r.condition.agent not in varied or r.place.label == r.condition.agent]
+        constant = [r for r in main if not isinstance(r.place.delay, str)]
+        tables.append(_table("normalised", "Normalised return, constant delays", setting, constant, results))
+        tables.append(_table("steps", "Steps to the delay-free return", setting, constant, results))
+        for agent in varied:
+            variants = [r for r in learners if r.condition.agent == agent]
+            compared = {(r.place.env, r.place.delay) for r in variants if r.place.label != agent}
+            ablation = [r for r in variants if (r.place.env, r.place.delay) in compared]
+            tables.append(_table("ablation", f"Ablation of {agent}", setting, ablation, results))
+        stochastic = [r for r in main if isinstance(r.place.delay, str)]
+        tables.append(_table("stochastic", "Normalised return, stochastic delays", setting, stochastic, results))
+    return [table for table in tables if table.rows]
+
+
+def _table(
+    kind: Kind, title: str, setting: Setting, chosen: Iterable[Result], results: Mapping[Place, Result]
+) -> Table:
+    """Lay out the chosen results. A column of the paper is there wherever the paper has a value for it."""
+    rows = sorted({(r.place.env, r.place.delay) for r in chosen}, key=lambda row: (row[0], delay_order(row[1])))
+    columns = {r.place.label for r in chosen}
+    in_paper = {(task, delay) for _, task, delay, *_ in published_values()}
+    if kind != "ablation" and any((env.removeprefix("delayrl/"), str(delay)) in in_paper for env, delay in rows):
+        agents = {column.split(" ")[0] for column in columns}
+        columns |= {agent for agent in PAPER_ORDER if agent not in agents}
+    keys = {place.label: _key(result) for place, result in results.items()}
+    entries = {
+        (env, delay, label): _entry(
+            kind,
+            results.get(Place(setting, env, delay, label)),
+            _published(kind, env, delay, *keys.get(label, (label, "transformer"))),
+        )
+        for env, delay in rows
+        for label in columns
+    }
+    return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
+
+
+def _key(result: Result) -> tuple[str, str]:
+    """The agent and its representation, by which the paper's values are found."""
+    return result.condition.agent, str(result.condition.overrides.get("representation", "transformer"))
+
+
+def _published(kind: Kind, env: str, delay: int | str, agent: str, representation: str) -> PublishedValue | None:
+    measure = "steps" if kind == "steps" else "normalised"
+    key = (measure, env.removeprefix("delayrl/"), str(delay), agent)
+    if kind == "ablation" or representation != "transformer":
+        return published_values().get((*key, representation))  # Table 3; its last column is VDPO itself, as in Table 2
+    return published_values().get((*key, ""))
+
+
+def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) -> TableEntry:
+    if result is None or (result.progress.state == "todo" and not result.runs):
+        return TableEntry(published=published)
+    raw, raw_std = statistics.mean_std(result.curves.final)
+    notes = [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
+    missed = False
+    if kind == "steps":
+        value, std = result.steps_to_threshold, NAN
+        if not math.isnan(result.reference_anchor.value) and result.runs:
+            missed = math.isnan(value) and not result.partial
+        if result.seeds_at_threshold:
+            notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds")
+    else:
+        value, std = statistics.mean_std(result.normalise(result.curves.final))
+    if result.reference_anchor.inside and result.runs:
+        notes.append(f"Ret_df: {result.reference_anchor.source}")
+    if result.unfinished:
+        notes.append(result.unfinished)
+    return TableEntry(value, std, raw, raw_std, missed, result.partial, " · ".join(notes), published)
