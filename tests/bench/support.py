@@ -56,18 +56,18 @@ def finish(process: subprocess.Popen, status: int = 0, timeout: float = 400) -> 
     return out + err
 
 
-def assert_same_results(file: Path, one: Path, other: Path) -> None:
+def assert_same_results(file: Path, runs: Path, expected: Path) -> None:
     """Every cell is done, with the same rows, none twice, and the same parameters."""
     grid: Grid = load_grid(file)
     for cell in grid.cells:
-        assert folders.stored(one / cell.folder, cell.seeds) == (cell.steps, True)
-        pairs = (folders.seed_folders(runs / cell.folder, cell.seeds) for runs in (one, other))
+        assert folders.stored(runs / cell.folder, cell.seeds) == (cell.condition.steps, True)
+        pairs = (folders.seed_folders(home / cell.folder, cell.seeds) for home in (runs, expected))
         for mine, theirs in zip(*pairs, strict=True):
             text = (mine / "rows.jsonl").read_text()
             assert text == (theirs / "rows.jsonl").read_text()
             rows = [json.loads(line) for line in text.splitlines()]
             episodes = [(row["step"], row["policy"], row["episode"]) for row in rows]
-            assert len(set(episodes)) == len(episodes) == cell.steps // 30
+            assert len(set(episodes)) == len(episodes) == cell.condition.steps // 30
             ours, others = (Run(run).latest().arrays("agent") for run in (mine, theirs))
             for name, array in ours.items():
                 np.testing.assert_array_equal(array, others[name])

@@ -1,6 +1,7 @@
 """Grids: what a TOML file stands for, and what is refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,7 @@ from delayrl.agents.registry import AGENTS
 from delayrl.bench.folders import claim
 from delayrl.bench.grid import load_grid, shipped
 from delayrl.cli.main import main
-from delayrl.run.configuration import values_of
-from delayrl.training.train import resolve
+from delayrl.run.condition import Condition, Setup, resolve
 
 BASIC = """
 preset = "small"
@@ -34,17 +34,19 @@ def test_product(tmp_path: Path) -> None:
     """Every combination once, task by task; ids differ and name the folders."""
     grid = load_grid(write(tmp_path, BASIC))
     wanted = [(t, d, a) for t in ("Reacher-v5", "Pendulum-v1") for d in (2, 3) for a in ("bpql", "a-sac")]
-    assert [(c.env, c.delay, c.agent) for c in grid.cells] == wanted
+    conditions = [cell.condition for cell in grid.cells]
+    assert [(c.env, c.delay, c.agent) for c in conditions] == wanted
     assert len(set(grid.ids)) == len({cell.folder for cell in grid.cells}) == 8
-    assert all(cell.seeds == (0, 1) and cell.steps == 15_000 and cell.id in cell.folder for cell in grid.cells)
+    assert all(condition.steps == 15_000 for condition in conditions)
+    assert all(cell.seeds == (0, 1) and cell.id in cell.folder for cell in grid.cells)
     assert (grid.name, grid.is_shipped) == ("grid", False)
 
 
 def test_tasks_are_finished_one_after_the_other(tmp_path: Path) -> None:
     text = BASIC + '[[product]]\nagents = ["sac"]\ndelays = [0]\n[[product]]\n'
-    cells = load_grid(write(tmp_path, text)).cells
-    assert [cell.env for cell in cells] == ["Reacher-v5"] * 5 + ["Pendulum-v1"] * 5
-    assert [cell.agent for cell in cells[:2]] == ["sac", "bpql"]
+    conditions = [cell.condition for cell in load_grid(write(tmp_path, text)).cells]
+    assert [condition.env for condition in conditions] == ["Reacher-v5"] * 5 + ["Pendulum-v1"] * 5
+    assert [condition.agent for condition in conditions[:2]] == ["sac", "bpql"]
 
 
 def ids(folder: Path, text: str) -> set[str]:
@@ -103,7 +105,8 @@ def test_overrides_of_all_of_a_product_and_of_an_agent(tmp_path: Path) -> None:
     [product.overrides.vdpo]
     width = 16
     """
-    cells = {(c.agent, c.delay): c for c in load_grid(write(tmp_path, text)).cells}
+    conditions = [cell.condition for cell in load_grid(write(tmp_path, text)).cells]
+    cells = {(condition.agent, condition.delay): condition for condition in conditions}
     assert cells["bpql", 2].overrides == {"steps": 5000}
     assert cells["vdpo", 2].overrides == {"steps": 5000, "width": 8, "layers": 1}
     assert cells["bpql", 3].overrides == {"steps": 6000}
@@ -131,39 +134,44 @@ def test_shipped_grids(name: str) -> None:
     assert grid.name == name
     assert grid.description
     assert grid.cells
-    assert {"sac", "random"} <= {cell.agent for cell in grid.cells if cell.delay == 0}  # what normalises
+    assert {"sac", "random"} <= {cell.condition.agent for cell in grid.cells if cell.condition.delay == 0}  # anchors
 
 
 def test_grids_of_the_paper() -> None:
     """Its tables' cells, ten seeds, its preset unchanged; runs that tables share are one."""
     table = load_grid("paper-table2")
-    late = {(c.env, c.delay, c.agent) for c in table.cells if c.delay}
+    conditions = [cell.condition for cell in table.cells]
+    delayed = {(c.env, c.delay, c.agent) for c in conditions if c.delay}
     agents = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
-    tasks = {cell.env for cell in table.cells}
+    tasks = {condition.env for condition in conditions}
     assert len(tasks) == 9
-    assert late == {
+    assert delayed == {
         (t, d, a) for t in tasks for d in (5, 25, 50) for a in agents if (t, d) != ("delayrl/Reacher-v4", 50)
     }
     assert all(cell.seeds == tuple(range(10)) for cell in table.cells)
-    order = [cell.env.removeprefix("delayrl/").removesuffix("-v4") for cell in table.cells]
+    order = [condition.env.removeprefix("delayrl/").removesuffix("-v4") for condition in conditions]
     wanted = "Pusher Hopper Swimmer HumanoidStandup Walker2d Ant HalfCheetah Humanoid Reacher"
     assert list(dict.fromkeys(order)) == wanted.split()
-    for cell in table.cells:
-        if cell.agent != "random":
-            config, schedule = resolve(cell.agent, cell.preset, cell.protocol, cell.overrides)
-            assert (config, schedule) == tuple(AGENTS[cell.agent].presets["paper"])
+    for condition in conditions:
+        if condition.agent != "random":
+            setup = setup_of(condition)
+            assert (setup.agent, setup.schedule) == tuple(AGENTS[condition.agent].presets["paper"])
     first = load_grid("paper-table1")
-    assert first.ids == [cell.id for cell in table.cells if cell.delay in (0, 5)]
-    assert [cell.agent for cell in first.cells[:5]] == ["sac", "random", "vdpo", "bpql", "ad-sac"]
+    assert first.ids == [cell.id for cell in table.cells if cell.condition.delay in (0, 5)]
+    assert [cell.condition.agent for cell in first.cells[:5]] == ["sac", "random", "vdpo", "bpql", "ad-sac"]
     ablation = load_grid("paper-ablation")
-    kinds = [values_of(resolve(c.agent, c.preset, c.protocol, c.overrides)[0]) for c in ablation.cells if c.delay]
-    names = [kind["representation"] for kind in kinds]
+    setups = [setup_of(cell.condition) for cell in ablation.cells if cell.condition.delay]
+    names = [setup.config["hyperparameters"]["representation"] for setup in setups]
     assert {name: names.count(name) for name in names} == {"transformer": 9, "transformer-no-belief": 9, "mlp": 9}
     assert sum(cell.id in first.ids for cell in ablation.cells) == 27  # the anchors, and VDPO itself
 
 
+def setup_of(c: Condition) -> Setup:
+    return resolve(c.agent, c.env, c.delay, c.preset, c.protocol, c.overrides)
+
+
 BAD = [
-    ("agents = [", "is no TOML file"),
+    ("agents = [", "is not a valid TOML file"),
     ("product = []", "there are no products, so nothing to run"),
     (BASIC + "product = []", "there are no products, so nothing to run"),
     ('agent = ["bpql"]\n', "unknown key 'agent' of the grid"),
@@ -172,7 +180,7 @@ BAD = [
     (BASIC.replace('["bpql", "a-sac"]', "[]"), "there are no agents, so nothing to run"),
     (BASIC.replace("[2, 3]", "[]"), "there are no delays"),
     (BASIC.replace("seeds = 2", "seeds = 0"), "there are no seeds"),
-    (BASIC.replace("seeds = 2", "seeds = [0, 2]"), "follow each other"),
+    (BASIC.replace("seeds = 2", "seeds = [0, 2]"), "must be consecutive"),
     (BASIC.replace("seeds = 2", "seeds = true"), "must be a number or a list"),
     (BASIC.replace("[2, 3]", "[2.5]"), "whole environment steps"),
     (BASIC.replace("[2, 3]", "[[2]]"), "delays cannot hold [2]"),
@@ -184,7 +192,7 @@ BAD = [
     (BASIC + "[overrides.vpdo]\nwidth = 3\n", "did you mean vdpo"),
     (BASIC + "[overrides]\nbpql = 3\n[[product]]\n[product.overrides.bpql]\nsteps = 9\n", "a table in one place"),
     (BASIC + "[overrides.bpql]\nsteps = 9\n[[product]]\n[product.overrides]\nbpql = 3\n", "a table in one place"),
-    (BASIC + 'preset = "big"\n', "is no TOML file"),  # twice
+    (BASIC + 'preset = "big"\n', "is not a valid TOML file"),  # twice
     (BASIC.replace("small", "big"), "unknown preset 'big'"),
     (BASIC.replace('"bpql"', '"a-sac"'), "two cells hold the same run"),
     (BASIC + "[[product]]\n[[product]]\nseeds = [1, 2]\n", "two cells hold the same run"),
@@ -220,12 +228,12 @@ def test_two_grids_of_one_name(tmp_path: Path) -> None:
         load_grid(write(tmp_path, BASIC)),
         load_grid(write(tmp_path / "other", BASIC + "protocol='official'")),
     )
-    claim(runs, mine.name, mine.source, mine.ids, look=True)
+    claim(runs, mine, check_only=True)
     assert not runs.exists()
-    claim(runs, mine.name, mine.source, mine.ids)
+    claim(runs, mine)
     with pytest.raises(delayrl.DelayRLError, match="two grids are named 'grid'"):
-        claim(runs, theirs.name, theirs.source, theirs.ids)
-    claim(runs, theirs.name, theirs.source, mine.ids)  # the same cells
-    claim(runs, mine.name, mine.source, mine.ids)
-    claim(runs, mine.name, mine.source, theirs.ids)  # edited
+        claim(runs, theirs)
+    claim(runs, replace(theirs, cells=mine.cells))
+    claim(runs, mine)
+    claim(runs, replace(mine, cells=theirs.cells))  # edited
     assert json.loads((runs / "grids" / "grid.json").read_text()) == {"source": "../grid.toml", "cells": theirs.ids}

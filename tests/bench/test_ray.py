@@ -14,9 +14,10 @@ from support import assert_same_results, tiny
 
 import delayrl
 from delayrl.bench import folders
+from delayrl.bench.backends.local import LocalBackend
+from delayrl.bench.backends.ray import RayBackend, Supervisor, connect
 from delayrl.bench.grid import load_grid
-from delayrl.bench.ray import OnRay, Supervisor, connect
-from delayrl.bench.runner import Local, work_off
+from delayrl.bench.runner import run_cells
 
 try:
     import ray
@@ -72,8 +73,8 @@ def test_an_address_that_is_not_rays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("cpus", "gpus"), [(0.0, 0.0), (-1.0, 0.0), (1.0, -1.0), (1.0, math.nan), (math.inf, 0.0)])
 def test_cores_that_cannot_be(cpus: float, gpus: float, tmp_path: Path) -> None:
-    with pytest.raises(delayrl.DelayRLError, match="a cell takes cores, or GPUs"):
-        OnRay(tmp_path, None, None, cpus, gpus)
+    with pytest.raises(delayrl.DelayRLError, match="a cell takes cores or GPUs"):
+        RayBackend(tmp_path, None, None, cpus, gpus)
 
 
 @needs_ray
@@ -82,7 +83,7 @@ def test_cores_that_cannot_be(cpus: float, gpus: float, tmp_path: Path) -> None:
 def test_more_than_the_cluster_has(tmp_path: Path) -> None:
     """One line; it would wait for ever."""
     with pytest.raises(delayrl.DelayRLError, match=r"a cell takes 1 cores and 99 GPUs .* has \d+ and \d+$"):
-        OnRay(tmp_path, None, None, 1.0, 99.0)
+        RayBackend(tmp_path, None, None, 1.0, 99.0)
     assert not ray.is_initialized()
 
 
@@ -101,7 +102,7 @@ def test_a_node_is_killed(tmp_path: Path) -> None:
 
     file = tiny(tmp_path, steps=3000)
     grid, runs, expected = load_grid(file), tmp_path / "runs", tmp_path / "expected"
-    work_off(grid.cells, expected, Local(expected, 2))
+    run_cells(grid.cells, expected, LocalBackend(expected, 2))
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
     said: list[str] = []
@@ -119,16 +120,16 @@ def test_a_node_is_killed(tmp_path: Path) -> None:
 
     thread = threading.Thread(target=kill)
     try:
-        backend = OnRay(runs, cluster.address)
+        backend = RayBackend(runs, cluster.address)
         assert backend.room() == 2
         thread.start()
-        report = work_off(grid.cells, runs, backend, say=said.append)
+        completion = run_cells(grid.cells, runs, backend, say=said.append)
     finally:
         thread.join()
         cluster.shutdown()
     assert killed, "both cells were over before a node could be killed"
-    assert len(report.done) == 2
-    assert not report.failed
+    assert len(completion.done) == 2
+    assert not completion.failed
     assert any("again from step" in line for line in said)
     assert sum(line.startswith("done") for line in said) == 2
     assert_same_results(file, runs, expected)
@@ -140,8 +141,8 @@ def test_a_node_is_killed(tmp_path: Path) -> None:
 def test_time_limit(tmp_path: Path) -> None:
     """On a cluster of its own: stopped at checkpoints, and nothing is left running."""
     grid, runs = load_grid(tiny(tmp_path, steps=60_000)), tmp_path / "runs"
-    report = work_off(grid.cells, runs, OnRay(runs, None), time_limit=40)
-    assert len(report.left) == 2
+    completion = run_cells(grid.cells, runs, RayBackend(runs, None), time_limit=40)
+    assert len(completion.unfinished) == 2
     last = [folders.journal(runs / cell.folder)[-1]["event"] for cell in grid.cells[:1]]
     assert last == ["stopped"]
     assert all(folders.holder(runs / cell.folder) is None for cell in grid.cells)

@@ -3,6 +3,7 @@
 import json
 import sqlite3
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,16 @@ from support import tiny
 
 import delayrl
 from delayrl.bench import folders
-from delayrl.bench.grid import Cell, Grid, load_grid
+from delayrl.bench.grid import Grid, load_grid
 from delayrl.bench.results import collect, read_table, rows_of, versions_of
 from delayrl.bench.status import standing, status
 from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
 from delayrl.run import provenance
+from delayrl.run.cell import Cell
 from delayrl.run.folder import Run
 
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 MIXED = """
 preset = "small"
 seeds = 2
@@ -78,7 +81,7 @@ def test_the_same_rows_give_the_same_bytes(finished, tmp_path: Path) -> None:
 def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> None:
     """Unknown columns come back, whether they hold for the run or differ; every version that worked on it is named."""
     grid, runs = finished
-    cell = Cell(**(vars(grid.cells[0]) | {"id": "0123"}))
+    cell = replace(grid.cells[0], id="0123")
     run = Run(runs / cell.folder / "seed0")
     source = Run(runs / grid.cells[0].folder / "seed0")
     run.create({k: v for k, v in source.config.items() if k != "format"})
@@ -97,17 +100,30 @@ def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> N
     assert {"commit", "device", "mujoco", "gymnasium"} <= set(json.loads(versions)[0])
 
 
+@pytest.mark.parametrize(
+    ("table", "grid", "count"),
+    [("first", "first", 3360), ("updates-per-call", BENCHMARKS / "updates-per-call.toml", 720)],
+)
+def test_committed_tables(table: str, grid: str | Path, count: int) -> None:
+    """They open, and their cells are still those of their grids, ids included."""
+    rows, cells, _ = read_table(BENCHMARKS / "results" / f"{table}.sqlite")
+    assert [cell for cell, _ in cells] == list(load_grid(grid).cells)
+    assert all((p.state, p.step) == ("done", cell.condition.steps) for cell, p in cells)
+    assert len(rows) == count
+    assert {row["cell"] for row in rows} == {cell.id for cell, _ in cells}
+
+
 def test_plain_sql(finished, tmp_path: Path) -> None:
     """Somebody without this library reads it."""
     grid, runs = finished
     collect(grid, runs, tmp_path / "t.sqlite")
     table = sqlite3.connect(tmp_path / "t.sqlite")
     query = "SELECT agent, env, delay, avg(return) FROM results WHERE step = 60 GROUP BY agent, env, delay"
-    (found,) = table.execute(query).fetchall()
+    (row,) = table.execute(query).fetchall()
     table.close()
     returns = [row["return"] for row in rows_of(grid.cells, runs) if row["step"] == 60]
-    assert found[:3] == ("random", "Reacher-v5", 2)
-    assert found[3] == pytest.approx(sum(returns) / len(returns))
+    assert row[:3] == ("random", "Reacher-v5", 2)
+    assert row[3] == pytest.approx(sum(returns) / len(returns))
 
 
 def test_bad_tables(finished, tmp_path: Path) -> None:
@@ -141,7 +157,7 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
 
 def test_an_episode_twice(finished, tmp_path: Path) -> None:
     grid, runs = finished
-    cell = Cell(**(vars(grid.cells[0]) | {"id": "4567"}))
+    cell = replace(grid.cells[0], id="4567")
     run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
     run.create({k: v for k, v in source.config.items() if k != "format"})
     run.append("rows", source.read("rows")[:2] + source.read("rows")[:1])
@@ -154,7 +170,7 @@ def test_an_episode_twice(finished, tmp_path: Path) -> None:
 def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
     """One line, from the report and before anything is published."""
     grid, runs = finished
-    cell = Cell(**(vars(grid.cells[0]) | {"id": "5678"}))
+    cell = replace(grid.cells[0], id="5678")
     run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
     run.remove()
     run.create({k: v for k, v in source.config.items() if k != "format"})
@@ -184,7 +200,7 @@ def test_worker(finished, tmp_path: Path) -> None:
     with folders.hold(home):
         assert work(home).kind == "locked"
         assert status(grid.cells[0], runs) == "running"
-    wrong = Cell(**(vars(grid.cells[0]) | {"id": "89ab", "delay": 50}))
+    wrong = replace(grid.cells[0], id="89ab", condition=replace(grid.cells[0].condition, delay=50))
     assert work_on(wrong, tmp_path).kind == "failed"
     assert "no shorter than an episode" in work(tmp_path / wrong.folder).line
     (tmp_path / wrong.folder / "cell.json").write_text("{")
@@ -219,7 +235,7 @@ def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkey
     Path("log.csv").write_text("\n".join("1234" * 100))
     file = tiny(tmp_path, text=MIXED.replace("delays = [2]", 'delays = ["recorded:log.csv"]'), name="recorded")
     cell = load_grid(file).cells[0]
-    assert len(cell.delay) > 400
+    assert len(cell.condition.delay) > 400
     assert work_on(cell, Path("runs")) == Outcome("done", "")
     (label,) = {row["delay"] for row in rows_of([cell], Path("runs"))}
     for command in ("plan", "status", "report"):

@@ -1,4 +1,4 @@
-"""Working off a grid on this machine: skipped, resumed, retried, stopped, locked."""
+"""Running a grid on this machine: cells are skipped, resumed, tried again, stopped, locked."""
 
 import contextlib
 import os
@@ -14,12 +14,15 @@ from support import assert_same_results, bench, finish, tiny, worker_of
 
 import delayrl
 from delayrl.bench import folders
-from delayrl.bench.grid import Cell, load_grid
-from delayrl.bench.runner import Local, work_off
+from delayrl.bench.backends.local import LocalBackend
+from delayrl.bench.grid import load_grid
+from delayrl.bench.runner import run_cells
 from delayrl.bench.status import line, seconds_left, standing
 from delayrl.bench.worker import Outcome
 from delayrl.cli.bench import seconds
 from delayrl.cli.main import main
+from delayrl.run.cell import Cell, Progress
+from delayrl.run.condition import Condition
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +98,7 @@ def test_time_limit(tmp_path: Path, cache: Path) -> None:
         for _ in range(6):  # on a slow machine compiling takes the whole time
             said = finish(bench("run", file, "--runs", runs, "--time-limit", "10s", cache=cache), 75)
             assert "0 of 2 cells done" in said
-            assert "the same command goes on" in said
+            assert "the same command resumes it" in said
             now = [p for _, p in standing(cells, runs)]
             assert [p.state for p in now] == ["todo", "todo"]
             before, reached = reached, sum(p.step for p in now)
@@ -197,18 +200,18 @@ class Script:
 
     def start(self, cell: Cell) -> None:
         self.running.append(cell)
-        self.started.append(cell.agent)
+        self.started.append(cell.condition.agent)
 
     def ended(self) -> list[tuple[Cell, Outcome]]:
         running, self.running = self.running, []
-        return [(cell, self.outcomes[cell.agent].pop(0)) for cell in running]
+        return [(cell, self.outcomes[cell.condition.agent].pop(0)) for cell in running]
 
     def stop(self) -> None: ...
     def close(self) -> None: ...
 
 
 def cells(*agents: str) -> list[Cell]:
-    return [Cell(agent, "Reacher-v5", 0, "small", "corrected", (0,), {}, 100, agent) for agent in agents]
+    return [Cell(Condition(agent, "Reacher-v5", 0, "small", steps=100), (0,), agent) for agent in agents]
 
 
 DIED, DONE, WRONG = Outcome("died", "killed by SIGKILL"), Outcome("done", ""), Outcome("failed", "discount: no")
@@ -223,14 +226,17 @@ def test_tries_are_bounded(tmp_path: Path) -> None:
     """Only those in a row that store nothing new count; a mistake is not tried again; the others go on."""
     backend = Script(sac=[DIED] * 9, bpql=[DIED, DIED, DONE], vdpo=[WRONG, DONE])
     began = time.monotonic()
-    report = work_off(cells("sac", "bpql", "vdpo"), tmp_path, backend, tries=3)
+    completion = run_cells(cells("sac", "bpql", "vdpo"), tmp_path, backend, tries=3)
     assert time.monotonic() - began > 2 + 4  # longer from time to time
     assert [backend.started.count(agent) for agent in ("sac", "bpql", "vdpo")] == [3, 3, 1]
-    assert [cell.agent for cell in report.done] == ["bpql"]
-    assert report.failed == {"sac": "3 tries stored nothing new; the last: killed by SIGKILL", "vdpo": "discount: no"}
+    assert [cell.condition.agent for cell in completion.done] == ["bpql"]
+    assert completion.failed == {
+        "sac": "3 tries stored nothing new; the last: killed by SIGKILL",
+        "vdpo": "discount: no",
+    }
     now = standing(cells("sac", "bpql", "vdpo"), tmp_path)
     assert [p.state for _, p in now] == ["failed", "todo", "failed"]
-    assert now[0][1].line == report.failed["sac"]
+    assert now[0][1].line == completion.failed["sac"]
     assert "2 failed" in line(now, 1)
 
 
@@ -239,13 +245,13 @@ def test_a_worker_that_cannot_be_started(tmp_path: Path) -> None:
 
     class Refuses(Script):
         def start(self, cell: Cell) -> None:
-            if cell.agent == "sac":
+            if cell.condition.agent == "sac":
                 raise delayrl.DelayRLError("the disk is full")
             super().start(cell)
 
-    report = work_off(cells("sac", "bpql"), tmp_path, Refuses(bpql=[DONE]))
-    assert report.failed == {"sac": "the disk is full"}
-    assert [cell.agent for cell in report.done] == ["bpql"]
+    completion = run_cells(cells("sac", "bpql"), tmp_path, Refuses(bpql=[DONE]))
+    assert completion.failed == {"sac": "the disk is full"}
+    assert [cell.condition.agent for cell in completion.done] == ["bpql"]
     assert [p.state for _, p in standing(cells("sac"), tmp_path)] == ["failed"]
 
 
@@ -253,16 +259,16 @@ def test_tries_with_progress_do_not_count(tmp_path: Path, monkeypatch) -> None:
     steps = iter([0, 0, 0, 10, 10, 20, 20, 30])
     monkeypatch.setattr(folders, "stored", lambda *_: (next(steps), False))
     backend = Script(sac=[DIED] * 5 + [DONE])
-    assert work_off(cells("sac"), tmp_path, backend, tries=2).failed == {}
+    assert run_cells(cells("sac"), tmp_path, backend, tries=2).failed == {}
     assert len(backend.started) == 6
 
 
 def test_a_cell_of_another_runner_is_waited_for(tmp_path: Path) -> None:
     locked = Outcome("locked", "another process works on it")
     backend = Script(sac=[locked, DONE], bpql=[DONE])
-    report = work_off(cells("sac", "bpql"), tmp_path, backend, tries=1)
+    completion = run_cells(cells("sac", "bpql"), tmp_path, backend, tries=1)
     assert backend.started == ["sac", "bpql", "sac"]
-    assert len(report.done) == 2
+    assert len(completion.done) == 2
 
 
 def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
@@ -279,7 +285,7 @@ def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
             else:
                 assert "sac" not in backend.started
 
-        assert len(work_off(some, tmp_path, backend, tick=tick).done) == 2
+        assert len(run_cells(some, tmp_path, backend, tick=tick).done) == 2
     assert backend.started == ["bpql", "sac"]
 
 
@@ -290,11 +296,11 @@ def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> Non
     def start(folder: Path, device: str | None) -> subprocess.Popen:
         return subprocess.Popen([sys.executable, "-c", sleep], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    monkeypatch.setattr("delayrl.bench.runner.start_worker", start)
-    began, backend = time.monotonic(), Local(tmp_path, 1)
-    report = work_off(cells("sac", "bpql"), tmp_path, backend, time_limit=1, grace=1)
+    monkeypatch.setattr("delayrl.bench.backends.local.start_worker", start)
+    began, backend = time.monotonic(), LocalBackend(tmp_path, 1)
+    completion = run_cells(cells("sac", "bpql"), tmp_path, backend, time_limit=1, grace=1)
     assert time.monotonic() - began < 20
-    assert {cell.agent for cell in report.left} == {"sac", "bpql"}
+    assert {cell.condition.agent for cell in completion.unfinished} == {"sac", "bpql"}
 
 
 def test_journal_after_a_crash(tmp_path: Path) -> None:
@@ -330,10 +336,10 @@ def test_time_left(tmp_path: Path) -> None:
     """At the speed of the same agent on the same task, else of the agent, else of all."""
     some = cells("sac", "bpql", "vdpo")
     states = [("done", 100, 10.0), ("running", 50, 5.0), ("todo", 0, None)]
-    now = [(cell, folders.Progress(*state, "")) for cell, state in zip(some, states, strict=True)]
+    now = [(cell, Progress(*state)) for cell, state in zip(some, states, strict=True)]
     assert seconds_left(now, 1) == pytest.approx(50 / 5 + 100 / 7.5)
     assert seconds_left(now, 2) == pytest.approx(100 / 7.5)  # the longest cell alone
-    assert seconds_left([(some[0], folders.Progress("todo", 0, None, ""))], 1) is None
+    assert seconds_left([(some[0], Progress("todo", 0))], 1) is None
     assert seconds_left(now[:1], 1) == 0
 
 

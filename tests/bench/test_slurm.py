@@ -14,9 +14,9 @@ from support import assert_same_results, bench, finish, tiny
 
 import delayrl
 from delayrl.bench import folders
+from delayrl.bench.backends.slurm import script, submit
 from delayrl.bench.grid import load_grid
-from delayrl.bench.slurm import script, submit
-from delayrl.cli.bench import bench as command
+from delayrl.cli.main import main
 
 NODE = Path(__file__).with_name("slurm_node.sh")
 PROGRAMS = ("slurmctld", "slurmd", "munged")
@@ -45,15 +45,15 @@ def test_script(tmp_path: Path) -> None:
 def test_written_for_another_machine(tmp_path: Path, capsys, monkeypatch) -> None:
     """Without --submit nothing is submitted; without sbatch one line says so; finished cells are left out."""
     file = tiny(tmp_path)
-    words = ["run", str(file), "--runs", str(tmp_path / "runs"), "--backend", "slurm"]
-    command(words)
+    words = ["bench", "run", str(file), "--runs", str(tmp_path / "runs"), "--backend", "slurm"]
+    main(words)
     path = tmp_path / "runs" / "slurm" / "tiny.sbatch"
     assert capsys.readouterr().out == f"{path}: 2 cells\nnext: sbatch {path}\n"
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(delayrl.DelayRLError, match="there is no sbatch here"):
         submit(path)
     monkeypatch.setattr("delayrl.cli.bench.status", lambda *_: "done")
-    command(words)
+    main(words)
     assert "all 2 cells are done" in capsys.readouterr().out
 
 
@@ -101,10 +101,10 @@ def test_a_real_slurm(node: dict[str, str], tmp_path: Path, monkeypatch) -> None
             shown = subprocess.run(
                 ["scontrol", "show", "job", f"{job}_{number}"], capture_output=True, text=True
             ).stdout
-            found = re.search(r"Restarts=(\d+)", shown)
-            restarts = max(restarts, int(found.group(1)) if found else 0)
-            if "JobState=PENDING" in shown and found and (number, found.group(1)) not in released:
-                released.add((number, found.group(1)))  # two minutes otherwise; a node needs some seconds to forget
+            counted = re.search(r"Restarts=(\d+)", shown)
+            restarts = max(restarts, int(counted.group(1)) if counted else 0)
+            if "JobState=PENDING" in shown and counted and (number, counted.group(1)) not in released:
+                released.add((number, counted.group(1)))  # two minutes otherwise; a node needs some seconds to forget
                 scontrol("update", f"JobId={job}_{number}", "StartTime=now+15")
             halfway = folders.stored(runs / cell.folder, cell.seeds)[0] > 1500
             if "JobState=RUNNING" in shown and halfway and not signalled and folders.holder(runs / cell.folder):
