@@ -1,6 +1,6 @@
-"""Any Gymnasium task, delayed, in a plain NumPy loop: needs only NumPy and Gymnasium, no JAX.
+"""Delay any Gymnasium task, in a plain loop: needs only NumPy and Gymnasium, no JAX.
 
-A controller for the pendulum that acts on the newest observation, with and without delay: the same law, later.
+A hand-written controller swings up the pendulum from the newest observation, under longer and longer delays.
 """
 
 import gymnasium as gym
@@ -10,7 +10,7 @@ from delayrl.wrappers import AugmentedObservation, Delayed
 
 
 def swing_up(obs: np.ndarray) -> np.ndarray:
-    """Pump energy into the pendulum, and hold it when it is up. obs: cos, sin, angular velocity."""
+    """Add energy to the pendulum, and hold it when it is up. obs: cos, sin, angular velocity."""
     angle, velocity = np.arctan2(obs[1], obs[0]), obs[2]
     energy = velocity**2 / 6 + 5 * obs[0] - 5
     torque = -10 * angle - 3 * velocity if abs(angle) < 0.6 else -np.sign(velocity) * energy
@@ -28,5 +28,5 @@ for delay in (0, 1, 3, 5):
             total += float(reward)
             done = terminated or truncated
         returns.append(total)
-    flat = AugmentedObservation(env)  # one vector for libraries that know nothing of delays
+    flat = AugmentedObservation(env)  # one vector, for libraries that know nothing about delays
     print(f"delay {delay}: return {np.mean(returns):6.0f}, flat observation {flat.observation_space.shape}")

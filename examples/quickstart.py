@@ -1,6 +1,6 @@
-"""Train a policy that tolerates a delay of three steps, load it, and act with it: under a minute on a CPU.
+"""Train a policy under a 3-step delay, load it, and act with it: under a minute on a CPU.
 
-The task is to hold s' = s + a at 0 while what is seen is three steps old.
+The task is to hold s' = s + a at 0 when observations are three steps old.
 """
 
 import tempfile

@@ -2,13 +2,13 @@
 
 python examples/ros2_node.py --ros-args -p policy:=BUNDLE -p on_overrun:=raise -p idle:="[0.0, 0.0]"
 
-Further parameters: `action_delay` and `dt`; below 0 (their default) they are the policy's own. `idle` is what the
-drives do in a period without a command; without it, they are taken to go on with the command before. While the newest
-observation is older than the policy can use, no command is published (`on_overrun`: `raise`; or `hold`, `clip`).
+Further parameters: `action_delay` and `dt`; a value below 0 (the default) stands for the policy's own. `idle` is what
+the drives do in a period without a command; by default they go on with the command before. While the newest observation
+is too old for the policy, no command is published (`on_overrun`: `raise`; or `hold`, `clip`).
 
-The observation is [position…, velocity…] of the JointState, in the order of the policy's task; its age comes from
-`header.stamp`, which must be the time of the measurement, on the clock of this node (`use_sim_time` works). rclpy is
-imported when the node is made: it comes with ROS and not from PyPI.
+The observation is [position…, velocity…] of the JointState, in the order of the policy's task. Its age comes from
+`header.stamp`, which must be the time of the measurement on the clock of this node (`use_sim_time` works). rclpy comes
+with ROS and not from PyPI, so it is imported only when the node is made.
 """
 
 import math
@@ -24,20 +24,20 @@ REPORT_EVERY = 10.0  # seconds
 
 
 def make_node(policy: ControlPolicy, **settings: Any) -> Any:
-    """The node; `settings` go to the controller: on_overrun, action_delay, dt, idle."""
+    """Make the node; `settings` go to the controller: on_overrun, action_delay, dt, idle."""
     from rclpy.node import Node
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
     class DelayedPolicy(Node):
-        """Observes whenever a message arrives, acts on a timer."""
+        """Observe whenever a message arrives, and act on a timer."""
 
         def __init__(self) -> None:
             super().__init__("delayed_policy")
             self.controller = Controller(policy, stamps="seconds", clock=self.seconds, **settings)
             self.output = self.create_publisher(Float64MultiArray, "commands", 1)
-            # the newest few are enough, and a lost one is no harm: best effort, not reliable
+            # best effort, because only the newest observation matters and lost ones do no harm
             self.create_subscription(JointState, "joint_states", self.observe, qos_profile_sensor_data)
             self.create_timer(settings.get("dt") or policy.dt, self.act)
             self.create_timer(REPORT_EVERY, self.report)
@@ -57,7 +57,7 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
                 return
             try:
                 action = self.controller.act()
-            except OverrunError as error:  # no command: the drive's own watchdog stops it
+            except OverrunError as error:  # without a command, the drive's own watchdog stops it
                 self.get_logger().error(str(error))
                 if settings.get("idle") is not None:
                     self.controller.override(settings["idle"])
@@ -79,8 +79,8 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
 
 
 def settings_of(node: Any) -> dict[str, Any]:
-    """What the parameters say, as `make_node` takes it, and `policy`."""
-    # ROS takes the types of parameters from their defaults: an empty list has none, so NaN stands for no idle action
+    """Return the parameters as `make_node` takes them, and `policy`."""
+    # ROS infers the types of parameters from their defaults, and an empty list has none: NaN stands for no idle action
     defaults = {"policy": "", "on_overrun": "raise", "action_delay": -1, "dt": -1.0, "idle": [math.nan]}
     values = {name: node.declare_parameter(name, default).value for name, default in defaults.items()}
     for name in ("action_delay", "dt"):

@@ -1,10 +1,10 @@
-"""Stable-Baselines3's SAC on a delayed task: the wrappers, and nothing else of ours.
+"""Stable-Baselines3's SAC on a delayed task, with only the wrappers of this library.
 
     pip install -e '.[examples]'
     python examples/stable_baselines.py --steps 6000
 
-`AugmentedObservation` makes one vector of what the delay leaves to know, so that an algorithm that has never heard of
-delays can learn; without it SAC sees a late observation and takes it for the current one.
+`AugmentedObservation` puts the newest observation and the actions since into one vector, so that an algorithm that
+knows nothing about delays can learn. Without it, SAC takes a late observation for the current one.
 """
 
 import argparse
@@ -26,7 +26,7 @@ def task(delay: str, augmented: bool) -> gym.Env:
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--steps", type=int, default=6000)
-parser.add_argument("--delay", default="uniform:1:5", help="a text as delayrl.delays reads it")
+parser.add_argument("--delay", default="uniform:1:5", help="in the text form of delayrl.delays (default: %(default)s)")
 given = parser.parse_args()
 
 for augmented in (True, False):

@@ -1,13 +1,13 @@
-// A delayrl policy bundle in C++17, without dependencies: weights and JSON in, actions out.
+// Run a delayrl policy bundle in C++17, without dependencies: weights and JSON in, actions out.
 //
 //   g++ -std=c++17 -O3 -march=native -o controller controller.cpp
 //   ./controller BUNDLE                 lines of  age obs[S] actions[Δ·A]  on stdin, lines of  action[A]  on stdout
 //   ./controller BUNDLE --latency N AGE N decisions at an age, ms: p50 p99 max, p99 of processor time
 //
-// Units are the task's own; `actions` are those applied since the observation was made, oldest first, and what stands
-// after the first `age` of them is not read. The policy remembers nothing between calls: keep the history yourself, by
-// counting actions that were applied. Reads bundle.json and policy.safetensors of format 1. Shapes are checked here,
-// the SHA-256 sums are not: let `delayrl latency BUNDLE` or load_bundle check a bundle that came over a network.
+// Units are the task's own. `actions` are those applied since the observation was made, oldest first; entries after the
+// first `age` are ignored. The policy is stateless: keep the history yourself, by counting the actions that were applied.
+// The program reads bundle.json and policy.safetensors of format 1. It checks shapes, but no SHA-256 sums: check a bundle
+// from a network with `delayrl latency BUNDLE` or load_bundle first.
 
 #include <algorithm>
 #include <chrono>
@@ -40,19 +40,19 @@ struct Json {
     std::map<std::string, Json> members;
 
     const Json& at(const std::string& name) const {
-        auto found = members.find(name);
-        if (found == members.end()) refuse("the bundle lacks \"" + name + "\"");
-        return found->second;
+        auto member = members.find(name);
+        if (member == members.end()) refuse("the bundle lacks \"" + name + "\"");
+        return member->second;
     }
-    std::size_t whole(double least, double most) const {
+    std::size_t integer(double least, double most) const {
         if (kind != number || !(value >= least && value <= most) || value != std::floor(value))
             refuse("the bundle has a number out of range");
         return static_cast<std::size_t>(value);
     }
-    std::vector<std::size_t> wholes(double most) const {
-        std::vector<std::size_t> found;
-        for (const Json& item : items) found.push_back(item.whole(0, most));
-        return found;
+    std::vector<std::size_t> integers(double most) const {
+        std::vector<std::size_t> values;
+        for (const Json& item : items) values.push_back(item.integer(0, most));
+        return values;
     }
 };
 
@@ -63,7 +63,7 @@ class Parser {
     Json document() {
         Json value = parse(0);
         space();
-        if (at_ != end_) refuse("there is something behind the JSON");
+        if (at_ != end_) refuse("something follows the JSON");
         return value;
     }
 
@@ -85,62 +85,62 @@ class Parser {
     }
     std::string text() {
         expect("\"");
-        std::string found;
+        std::string text;
         while (at_ != end_ && *at_ != '"') {
-            if (*at_ == '\\') {  // names and values that we need have no escapes: keep them as they stand
-                found += *at_++;
+            if (*at_ == '\\') {  // the names and values that we need have no escapes: keep others as they are
+                text += *at_++;
                 if (at_ == end_) break;
             }
-            found += *at_++;
+            text += *at_++;
         }
         expect("\"");
-        return found;
+        return text;
     }
     Json parse(int depth) {
         if (depth > 20) refuse("JSON is nested too deeply");
         space();
-        Json found;
+        Json node;
         if (at_ == end_) refuse("the JSON ends too early");
         if (*at_ == '{') {
-            found.kind = Json::object;
+            node.kind = Json::object;
             ++at_;
             space();
-            if (accept("}")) return found;
+            if (accept("}")) return node;
             do {
                 space();
                 std::string name = text();
                 expect(":");
-                if (!found.members.emplace(name, parse(depth + 1)).second) refuse("a name stands twice in the JSON");
+                if (!node.members.emplace(name, parse(depth + 1)).second) refuse("a name occurs twice in the JSON");
                 space();
             } while (accept(","));
             expect("}");
         } else if (*at_ == '[') {
-            found.kind = Json::list;
+            node.kind = Json::list;
             ++at_;
             space();
-            if (accept("]")) return found;
+            if (accept("]")) return node;
             do {
-                found.items.push_back(parse(depth + 1));
+                node.items.push_back(parse(depth + 1));
                 space();
             } while (accept(","));
             expect("]");
         } else if (*at_ == '"') {
-            found.kind = Json::text;
-            found.string = text();
+            node.kind = Json::text;
+            node.string = text();
         } else if (accept("true") || accept("false")) {
-            found.kind = Json::boolean;
+            node.kind = Json::boolean;
         } else if (accept("null")) {
-            found.kind = Json::null;
+            node.kind = Json::null;
         } else {
             const char* start = at_;
             while (at_ != end_ && *at_ != 0 && std::strchr("0123456789+-.eE", *at_)) ++at_;
             std::string digits(start, at_);
             char* rest = nullptr;
-            found.kind = Json::number;
-            found.value = std::strtod(digits.c_str(), &rest);
-            if (digits.empty() || *rest != 0 || !std::isfinite(found.value)) refuse("damaged number in the JSON");
+            node.kind = Json::number;
+            node.value = std::strtod(digits.c_str(), &rest);
+            if (digits.empty() || *rest != 0 || !std::isfinite(node.value)) refuse("damaged number in the JSON");
         }
-        return found;
+        return node;
     }
 };
 
@@ -157,7 +157,7 @@ std::string contents(const std::string& path, std::size_t limit) {
     return data;
 }
 
-// safetensors: 8 bytes of header length, a JSON header with types, shapes and offsets, then the numbers.
+// safetensors: 8 bytes with the header's length, a JSON header with types, shapes and offsets, then the numbers.
 class Weights {
    public:
     explicit Weights(const std::string& path) : data_(contents(path, std::size_t{1} << 30)) {
@@ -171,10 +171,10 @@ class Weights {
 
     Floats take(const std::string& name, const std::vector<std::size_t>& shape) const {
         const Json& entry = header_.at(name);
-        std::vector<std::size_t> offsets = entry.at("data_offsets").wholes(1 << 30);
+        std::vector<std::size_t> offsets = entry.at("data_offsets").integers(1 << 30);
         std::size_t count = 1;
-        for (std::size_t size : shape) count *= size;  // shapes are ours, of sizes that were checked
-        if (entry.at("dtype").string != "F32" || entry.at("shape").wholes(1 << 30) != shape || offsets.size() != 2 ||
+        for (std::size_t size : shape) count *= size;  // cannot overflow, because the sizes were checked
+        if (entry.at("dtype").string != "F32" || entry.at("shape").integers(1 << 30) != shape || offsets.size() != 2 ||
             offsets[1] < offsets[0] || offsets[1] - offsets[0] != 4 * count || offsets[1] > data_.size() - first_)
             refuse("the array " + name + " is not as the bundle describes it");
         Floats values(count);
@@ -197,7 +197,7 @@ struct Layer {
     Floats w, b;
 };
 
-// [rows, inputs] -> [rows, outputs]: x w + b, four rows at once, so that w is read a quarter as often
+// [rows, inputs] -> [rows, outputs]: x w + b, four rows at once, which reads w a quarter as often
 Floats linear(const Layer& layer, const Floats& x, std::size_t rows) {
     const std::size_t n = layer.outputs;
     Floats y(rows * n);
@@ -254,7 +254,7 @@ struct Norm {
     }
 };
 
-// One attention head: query·key is x M x' + c·x', up to what the softmax does not see; value and output are one matrix.
+// One attention head: query·key is x M x' + c·x', up to terms that cancel in the softmax; value and output are one matrix.
 struct Block {
     Norm norm1, norm2;
     Layer attend, value, first, second;
@@ -266,11 +266,11 @@ class Policy {
    public:
     explicit Policy(const std::string& folder) {
         const Json bundle = Parser(contents(folder + "/bundle.json", std::size_t{1} << 20)).document();
-        if (bundle.at("format").whole(0, 1e9) != 1) refuse("the bundle has another format than 1");
+        if (bundle.at("format").integer(0, 1e9) != 1) refuse("the bundle has another format than 1");
         const Json& described = bundle.at("policy");
-        obs_size = described.at("obs_size").whole(1, 1e6);
-        action_size = described.at("action_size").whole(1, 1e6);
-        max_age = described.at("max_age").whole(0, 1e4);
+        obs_size = described.at("obs_size").integer(1, 1e6);
+        action_size = described.at("action_size").integer(1, 1e6);
+        max_age = described.at("max_age").integer(0, 1e4);
         if (max_age * action_size > 10000000) refuse("the action history is too large");
         low_ = numbers(described.at("low"));
         high_ = numbers(described.at("high"));
@@ -278,7 +278,7 @@ class Policy {
         for (std::size_t j = 0; j < action_size; ++j)
             if (!(low_[j] < high_[j]) || !std::isfinite(high_[j] - low_[j])) refuse("low must lie below high, both finite");
         input_ = described.at("input").string;
-        const std::size_t width = described.at("width").whole(0, 1e6), blocks = described.at("blocks").whole(0, 1000);
+        const std::size_t width = described.at("width").integer(0, 1e6), blocks = described.at("blocks").integer(0, 1000);
 
         const Weights weights(folder + "/policy.safetensors");
         std::size_t read = obs_size;
@@ -288,7 +288,7 @@ class Policy {
         else if (input_ == "transformer")
             read = width;
         else if (input_ != "observation")
-            refuse("the policy reads an input that this program does not know");
+            refuse("the policy reads an input that this program does not support");
         head_ = network(weights, "head", read, described.at("hidden"));
         if (described.at("current").kind == Json::list)
             current_ = network(weights, "current", obs_size, described.at("current"));
@@ -339,12 +339,12 @@ class Policy {
     std::vector<Block> blocks_;
 
     static Floats numbers(const Json& list) {
-        Floats found;
+        Floats values;
         for (const Json& item : list.items) {
             if (item.kind != Json::number) refuse("low and high must be numbers");
-            found.push_back(static_cast<float>(item.value));
+            values.push_back(static_cast<float>(item.value));
         }
-        return found;
+        return values;
     }
 
     static Layer layer(const Weights& weights, const std::string& name, std::size_t inputs, std::size_t outputs) {
@@ -352,7 +352,7 @@ class Policy {
     }
 
     Mlp network(const Weights& weights, const std::string& name, std::size_t inputs, const Json& hidden) const {
-        std::vector<std::size_t> sizes = hidden.wholes(1e6);
+        std::vector<std::size_t> sizes = hidden.integers(1e6);
         sizes.push_back(action_size);
         Mlp layers;
         for (std::size_t i = 0; i < sizes.size(); ++i) {
@@ -368,7 +368,7 @@ class Policy {
         };
         of_obs_ = layer(weights, "encoder.obs", obs_size, width);
         of_action_ = layer(weights, "encoder.action", action_size, width);
-        const Layer join = layer(weights, "encoder.join", 2 * width, width);  // of both embeddings side by side
+        const Layer join = layer(weights, "encoder.join", 2 * width, width);  // applied to both embeddings side by side
         const auto middle = join.w.begin() + width * width;
         join_obs_ = {width, width, Floats(join.w.begin(), middle), join.b};
         join_action_ = {width, width, Floats(middle, join.w.end()), Floats(width)};
@@ -380,7 +380,7 @@ class Policy {
             const Layer qkv = layer(weights, name + ".qkv", width, 3 * width);
             const Layer out = layer(weights, name + ".out", width, width);
             Layer attend{width, width, Floats(width * width), Floats(width)}, value = attend;
-            // row r of q, k, v, and in the row `width` their biases
+            // row r of q, k or v; row `width` holds the biases
             auto part = [&](std::size_t r, std::size_t which) {
                 return (r < width ? &qkv.w[r * 3 * width] : &qkv.b[0]) + which * width;
             };
@@ -399,7 +399,7 @@ class Policy {
         }
     }
 
-    // The transformer's output at position age - 1, the only one that is read: [width]
+    // The transformer's output at position age - 1, which alone is read: [width]
     Floats encode(const Floats& obs, const Floats& actions, std::size_t age) const {
         const std::size_t width = norm_in_.scale.size();
         const Floats from_obs = linear(join_obs_, linear(of_obs_, obs, 1), 1);
@@ -410,7 +410,7 @@ class Policy {
             const Block& block = blocks_[i];
             x = block.norm1(std::move(x));
             const bool last = i + 1 == blocks_.size();
-            const std::size_t first = last ? age - 1 : 0, rows = age - first;  // the positions that go on
+            const std::size_t first = last ? age - 1 : 0, rows = age - first;  // the positions that are needed
             Floats asking(x.begin() + first * width, x.end());
             const Floats asked = linear(block.attend, asking, rows);
             Floats mixed(rows * width);
@@ -452,7 +452,7 @@ void serve(const Policy& policy) {
         for (float& value : actions) words >> value;
         std::string rest;
         if (!words || !(age >= 0 && age <= static_cast<double>(policy.max_age)) || age != std::floor(age) || words >> rest)
-            refuse("a line needs an age, an observation and an action history, and nothing else");
+            refuse("a line needs an age, an observation and an action history, nothing else");
         const Floats action = policy.act(obs, actions, static_cast<std::size_t>(age));
         for (std::size_t j = 0; j < action.size(); ++j) std::printf(j ? " %.9g" : "%.9g", action[j]);
         std::printf("\n");
@@ -474,7 +474,7 @@ void time_decisions(const Policy& policy, int decisions, std::size_t age) {
         policy.act(obs, actions, age);
         const std::chrono::duration<double, std::milli> passed = std::chrono::steady_clock::now() - began;
         const double work = 1000.0 * static_cast<double>(std::clock() - clock) / CLOCKS_PER_SEC;
-        if (i < 0) continue;  // the first ones warm the caches
+        if (i < 0) continue;  // warm-up
         taken.push_back(passed.count());
         worked.push_back(work);
     }

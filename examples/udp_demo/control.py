@@ -1,4 +1,4 @@
-"""The controller: a policy in a process of its own, which sees the plant only through UDP. Prints its statistics."""
+"""Run a policy in its own process, which sees the plant only through UDP. Prints the controller's statistics."""
 
 import argparse
 import dataclasses
@@ -17,36 +17,36 @@ from wire import ACTION, APPLIED, END, HELLO, OBSERVATION, PAUSE, TICK, Packet, 
 from delayrl.deploy import ClockError, Controller
 from delayrl.errors import DelayRLError
 
-PATIENCE = 120.0  # seconds of silence after which the simulator is gone
+PATIENCE = 120.0  # seconds to wait for the simulator
 
 
-class Told:
-    """What the actuator says that it did, until the controller has come to that step."""
+class AppliedActions:
+    """Keep what the actuator reports until the controller has reached that step, then correct the history."""
 
     def __init__(self, controller: Controller, listens: bool) -> None:
         self._controller, self._listens = controller, listens
         self._actions: dict[int, np.ndarray] = {}
 
     def take(self, packet: Packet) -> None:
-        """What was done in a step; it may be told before the controller has acted for it, if that is late."""
+        """Take in the report of a step, which may arrive before the controller has acted for it."""
         if self._listens:
             self._actions[packet.step] = packet.values
             self.settle()
 
     def settle(self) -> None:
-        """Correct the history as far as it goes."""
+        """Correct the history up to the controller's step."""
         for step in [step for step in self._actions if step <= self._controller.step]:
             self._controller.applied(self._actions.pop(step), step)
 
     def forget(self) -> None:
-        """An episode is over."""
+        """Drop all reports, because their episode is over."""
         self._actions.clear()
 
 
-def lockstep(controller: Controller, line: socket.socket, told: Told) -> None:
-    """Answer every tick once; a tick that comes again gets the same answer.
+def lockstep(controller: Controller, line: socket.socket, applied: AppliedActions) -> None:
+    """Answer every tick once; a repeated tick gets the same answer.
 
-    Before the first observation it answers zeros, which the plant does by itself: no command.
+    Before the first observation the answer is zeros. They are not a command: the plant does the same on its own.
     """
     arrived: dict[int, np.ndarray] = {}
     answer, answered = b"", -1
@@ -60,17 +60,17 @@ def lockstep(controller: Controller, line: socket.socket, told: Told) -> None:
         if packet.episode == controller.episode + 1:
             controller.reset()
             arrived.clear()
-            told.forget()
+            applied.forget()
             answered = -1
         if packet.episode != controller.episode:
             continue
         if packet.kind == OBSERVATION:
             arrived[packet.step] = packet.values
         elif packet.kind == APPLIED:
-            told.take(packet)
+            applied.take(packet)
         elif packet.kind == TICK and packet.step == answered + 1:
             due = [int(k) for k in packet.values]
-            if all(k in arrived for k in due):  # else it comes again
+            if all(k in arrived for k in due):  # otherwise the tick comes again
                 for k in due:
                     controller.observe(arrived[k], k, packet.step)
                 nothing = np.zeros(controller.policy.action_size, np.float32)
@@ -81,14 +81,14 @@ def lockstep(controller: Controller, line: socket.socket, told: Told) -> None:
             line.send(answer)
 
 
-def real_time(controller: Controller, line: socket.socket, told: Told) -> None:
-    """One thread listens, this one acts: a quarter of a step after each step's beginning, for its beginning."""
+def real_time(controller: Controller, line: socket.socket, applied: AppliedActions) -> None:
+    """Listen in another thread; act a quarter of a step after the beginning of each step, for its beginning."""
     dt = controller.policy.dt
     assert dt is not None
     turn = threading.Condition()
-    begun: float | None = None  # when step 0 began; None between two episodes
+    begun: float | None = None  # when step 0 began; None between episodes
     over = False
-    broken: list[BaseException] = []
+    errors: list[BaseException] = []
 
     def listen() -> None:
         nonlocal begun, over
@@ -105,14 +105,14 @@ def real_time(controller: Controller, line: socket.socket, told: Told) -> None:
                     elif packet.kind == OBSERVATION and packet.episode == controller.episode + 1:
                         begun = packet.stamp - packet.step * dt
                         controller.reset(begun)
-                        told.forget()
+                        applied.forget()
                     if packet.kind == OBSERVATION:
                         controller.observe(packet.values, packet.stamp, episode=packet.episode)
                     elif packet.kind == APPLIED and packet.episode == controller.episode:
-                        told.take(packet)
+                        applied.take(packet)
                     turn.notify()
         except BaseException as error:
-            broken.append(error)
+            errors.append(error)
             with turn:
                 over = True
                 turn.notify()
@@ -129,7 +129,7 @@ def real_time(controller: Controller, line: socket.socket, told: Told) -> None:
             assert begun is not None
             if episode != controller.episode:
                 episode, step = controller.episode, -1
-            step = max(step + 1, math.floor((time.monotonic() - begun) / dt - 0.25))  # later ones were missed
+            step = max(step + 1, math.floor((time.monotonic() - begun) / dt - 0.25))  # skip steps that were missed
             at = begun + step * dt
         time.sleep(max(0.0, at + 0.25 * dt - time.monotonic()))
         with turn:
@@ -137,16 +137,16 @@ def real_time(controller: Controller, line: socket.socket, told: Told) -> None:
                 continue
             try:
                 action = controller.act(at)
-            except ClockError:  # woken so late that newer observations are here: the next tick's turn
+            except ClockError:  # woke up after a newer observation: wait for the next step
                 continue
-            told.settle()
+            applied.settle()
         line.send(encode(ACTION, episode, step, at, action))
-    if broken:
-        raise broken[0]
+    if errors:
+        raise errors[0]
 
 
 def finite(value: Any) -> Any:
-    """JSON knows no NaN."""
+    """Return None for NaN, which JSON does not have."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -162,12 +162,12 @@ def main() -> None:
     try:
         stamps = "seconds" if given.real_time else "steps"
         policy = load(given.policy, given.blind)
-        # this plant carries out commands at once, whatever the policy was trained for
+        # this plant executes commands at once, whatever the policy was trained for
         controller = Controller(policy, stamps=stamps, action_delay=0, on_overrun=given.on_overrun)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             line.settimeout(PATIENCE)
-            line.connect(("127.0.0.1", given.port))  # packets of others are not delivered
-            (real_time if given.real_time else lockstep)(controller, line, Told(controller, not given.deaf))
+            line.connect(("127.0.0.1", given.port))  # packets from elsewhere are not delivered
+            (real_time if given.real_time else lockstep)(controller, line, AppliedActions(controller, not given.deaf))
     except (DelayRLError, OSError) as error:
         sys.exit(f"controller: {error}")
     statistics = dataclasses.asdict(controller.statistics)

@@ -1,8 +1,8 @@
-"""Simulator and controller as two processes over UDP: a policy that knows of the delay, and one that does not.
+"""Compare policies that know about the delay with ones that do not: simulator and controller talk over UDP.
 
 python examples/udp_demo/demo.py --policy RUN      (a run folder, a bundle, or "predictor", which needs no training)
 
-A run to take: delayrl train vdpo --env InvertedPendulum-v5 --delay 5 --preset small --out RUN
+To train a policy: delayrl train vdpo --env InvertedPendulum-v5 --delay 5 --preset small --out RUN
 """
 
 import argparse
@@ -22,10 +22,10 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Scenario:
-    """A network, the controller behind it, and whether time is the clock's.
+    """A network, the controller behind it, and whether it runs in real time.
 
-    The controllers: `delayed` keeps the history; `deaf` does too, but is not told what the actuator did; `blind` takes
-    every observation for current.
+    The controller `delayed` keeps the history. So does `deaf`, but it ignores what the actuator reports. `blind` takes
+    every observation for the current one.
     """
 
     name: str
@@ -53,10 +53,10 @@ REAL_TIME = [
 
 
 def play(scenario: Scenario, policy: str, episodes: int, seed: int, steps: int | None = None) -> tuple[list[Row], Row]:
-    """Start both processes, wait for them: a row for each episode, and the controller's statistics.
+    """Run both processes to their end; return a row for each episode, and the controller's statistics.
 
     Raises:
-        SystemExit: one of them failed; what it said.
+        SystemExit: with the error message of a process that failed.
     """
     network = [f"--{name}={value}" for name, value in asdict(scenario.link).items()]
     options = ["--real-time"] if scenario.real_time else []
@@ -70,17 +70,17 @@ def play(scenario: Scenario, policy: str, episodes: int, seed: int, steps: int |
         kind = {"blind": ["--blind"], "deaf": ["--deaf"], "delayed": []}[scenario.controller]
         control = _start("control.py", f"--policy={policy}", f"--port={json.loads(first)['port']}", *kind, *options)
         try:
-            said, complaint = control.communicate()
+            statistics, errors = control.communicate()
             if control.returncode:
-                raise SystemExit(complaint.strip())
-            lines, complaint = plant.communicate(timeout=60)
+                raise SystemExit(errors.strip())
+            lines, errors = plant.communicate(timeout=60)
             if plant.returncode:
-                raise SystemExit(complaint.strip())
+                raise SystemExit(errors.strip())
         finally:
             control.kill()
     finally:
         plant.kill()
-    return [json.loads(line) for line in lines.splitlines()], json.loads(said)
+    return [json.loads(line) for line in lines.splitlines()], json.loads(statistics)
 
 
 def _start(program: str, *arguments: str) -> subprocess.Popen[str]:
@@ -89,7 +89,7 @@ def _start(program: str, *arguments: str) -> subprocess.Popen[str]:
 
 
 def describe(policy: str) -> Row:
-    """What was run, and on what: for the rows."""
+    """Return what was run, and with which versions, for the rows."""
     from delayrl.run.provenance import versions
 
     about: Row = {"agent": policy if policy == "predictor" else "bundle"}
@@ -104,12 +104,12 @@ def main() -> None:
     parser.add_argument("--policy", default="predictor", help="a run folder, a bundle, or: predictor (default)")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0, help="of start states and network (default: 0)")
-    parser.add_argument("--real-time", action="store_true", help="also by the clock: 40 s for each episode that stands")
+    parser.add_argument("--real-time", action="store_true", help="also run in real time: 40 s for each full episode")
     parser.add_argument("--rows", type=Path, default=Path("udp.jsonl"), help="(default: udp.jsonl)")
     parser.add_argument("--picture", type=Path, default=Path("udp.png"), help="(default: udp.png)")
     given = parser.parse_args()
     if given.policy == "predictor":
-        print("no --policy: the predictor plays. For a trained one:\n" + __doc__.splitlines()[-1] + "\n")
+        print("no --policy: running the predictor, which needs no training.\n" + __doc__.splitlines()[-1] + "\n")
 
     lines: list[Row] = [describe(given.policy) | {"episodes": given.episodes, "seed": given.seed}]
     print(f"{'observations':<52}{'policy':<9}{'mean':>7}{'worst':>7}   age")

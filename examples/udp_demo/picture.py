@@ -1,4 +1,4 @@
-"""What the demonstration shows: the pole's angle, and every episode's return."""
+"""Plot the rows of the demonstration: the angle of the pole, and the return of every episode."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ SHOWN = 100  # steps of the first panel
 
 
 def draw(lines: list[dict[str, Any]], out: Path) -> None:
-    """From rows of `demo.py`: left the first episode of the roughest network, right all returns."""
+    """Plot rows of `demo.py`: on the left the first episode of the roughest network, on the right all returns."""
     rows = [line for line in lines if "return" in line]
     names = list(dict.fromkeys(row["scenario"] for row in rows))
     roughest = next(name for name in reversed(names) if name.endswith("late"))

@@ -1,4 +1,4 @@
-"""What runs in the controller: a trained policy, the same one blind to the delay, or a model that needs no training."""
+"""The policies of the demonstration: a trained one, one that ignores the delay, and a model that needs no training."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from delayrl.errors import DelayRLError
 
 
 class RunPolicy:
-    """The policy of a run folder, played by JAX.
+    """The policy of a run folder, computed by JAX.
 
     Raises:
         DelayRLError: not a run folder, or no good checkpoint.
@@ -31,14 +31,15 @@ class RunPolicy:
         env.close()
 
     def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
-        """In the task's units."""
+        """Return the action in the task's units."""
         return self._policy.act(obs, {"age": age, "actions": actions}).astype(np.float32)
 
 
 class Predictor:
-    """No learning: a linear model of the plant, the state predicted over the actions since, and an optimal gain (LQR).
+    """Predict the present state with a linear model and the actions since, and apply an optimal gain (LQR).
 
-    The model is measured on the simulator, around standing still. It stands only if age and history are right.
+    The model is linearised from the simulator around the upright pole. The pole stands only if age and history are
+    right.
     """
 
     def __init__(self, env: str = "InvertedPendulum-v5", max_age: int = 5) -> None:
@@ -56,27 +57,26 @@ class Predictor:
 
         size, small = self.obs_size, 1e-5
         rest, still = np.zeros(size), np.zeros(self.action_size)
-        nudge = [(small * one, still) for one in np.eye(size)] + [
-            (rest, small * one) for one in np.eye(self.action_size)
-        ]
-        columns = [(step(rest + s, a) - step(rest - s, -a)) / (2 * small) for s, a in nudge]
+        nudges = [(small * unit, still) for unit in np.eye(size)]
+        nudges += [(rest, small * unit) for unit in np.eye(self.action_size)]
+        columns = [(step(rest + s, a) - step(rest - s, -a)) / (2 * small) for s, a in nudges]
         self._A, self._B = np.array(columns[:size]).T, np.array(columns[size:]).T
         task.close()
         P = np.eye(size)
-        for _ in range(2000):  # the Riccati equation, by going round
+        for _ in range(2000):  # iterate the Riccati equation
             gain = np.linalg.solve(0.1 * np.eye(self.action_size) + self._B.T @ P @ self._B, self._B.T @ P @ self._A)
             P = np.eye(size) + self._A.T @ P @ (self._A - self._B @ gain)
         self._gain = gain
 
     def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
-        """Predict, then act."""
+        """Predict the present state, then act."""
         for action in actions[:age]:
             obs = self._A @ obs + self._B @ action
         return np.clip(-self._gain @ obs, self.low, self.high).astype(np.float32)
 
 
 class Blind:
-    """A policy that takes every observation for current: of VDPO it is the reference, which learned without delay."""
+    """A policy that takes every observation for the current one. Of VDPO, this is the reference policy."""
 
     def __init__(self, policy: ControlPolicy) -> None:
         self._policy = policy
@@ -85,15 +85,15 @@ class Blind:
         self._nothing = np.zeros((policy.max_age, policy.action_size), np.float32)
 
     def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
-        """As if the age were 0."""
+        """Act as if the age were 0."""
         return self._policy(obs, self._nothing, 0)
 
 
 def load(source: str, blind: bool = False) -> ControlPolicy:
-    """A policy by its source: a run folder, a bundle (`delayrl export`), or "predictor".
+    """Load a policy from a run folder or a bundle (`delayrl export`), or make the "predictor".
 
     Raises:
-        DelayRLError: nothing of this kind is there.
+        DelayRLError: the source is none of these.
     """
     policy: ControlPolicy
     if source == "predictor":
@@ -104,6 +104,6 @@ def load(source: str, blind: bool = False) -> ControlPolicy:
         try:
             from delayrl.deploy import load_bundle
         except ImportError:
-            raise DelayRLError(f"{source} is no run folder: train one with `delayrl train vdpo …`") from None
+            raise DelayRLError(f"{source} is not a run folder: train one with `delayrl train vdpo …`") from None
         policy = load_bundle(source)
     return Blind(policy) if blind else policy

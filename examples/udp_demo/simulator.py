@@ -1,12 +1,12 @@
-"""The plant: a Gymnasium task in a process of its own, behind a bad network. Prints JSON: its port, then each episode.
+"""Run the plant in its own process: a Gymnasium task behind a bad network. Prints JSON: its port, then each episode.
 
-Lockstep (the default): at each step it sends the observations that arrive now and a tick that names them, repeats both
-until the action for this step is back, and steps. Nothing depends on how busy the machine is.
+In lockstep (the default), each step sends the observations that arrive now and a tick that names them. It repeats both
+until the action for this step is back. The result does not depend on how busy the machine is.
 
-Real time: a step every dt seconds by the clock. The observation is made, and sets out, at the beginning of a step; half
-a step later the newest action that has arrived is applied, whatever it was chosen for.
+In real time, there is a step every dt seconds. The observation is made and sent at the beginning of a step. Half a step
+later the newest action that has arrived is applied, whichever step it was chosen for.
 
-The actuator tells at once what it did in a step. It is beside the controller; the sensor is what is far away.
+The actuator reports without delay what it did in a step: it is next to the controller, only the sensor is far away.
 """
 
 import argparse
@@ -22,8 +22,8 @@ import numpy as np
 from link import Link, Travelling
 from wire import ACTION, APPLIED, END, HELLO, OBSERVATION, PAUSE, TICK, decode, encode
 
-TRACED = 151  # steps of the first episode whose first two numbers are told
-PATIENCE = 120.0  # seconds until a silent controller is given up; it may have to load and compile first
+TRACED = 151  # steps of the first episode whose first two numbers are printed
+PATIENCE = 120.0  # seconds to wait for the controller, which may have to load and compile first
 
 
 class Line:
@@ -44,12 +44,12 @@ class Line:
                 self.peer = sender
 
     def send(self, *packets: bytes) -> None:
-        """To the controller."""
+        """Send packets to the controller."""
         for packet in packets:
             self.socket.sendto(packet, self.peer)
 
     def action(self, episode: int, timeout: float, steps: range) -> tuple[int, np.ndarray] | None:
-        """The next action of this episode for one of these steps; None if none comes in time."""
+        """Receive the next action of an episode for one of these steps, with its step; None if none comes in time."""
         deadline = time.monotonic() + timeout
         while True:
             try:
@@ -71,17 +71,17 @@ Play = Callable[[gym.Env, Line, Travelling, int, int], dict[str, Any]]
 
 
 def lockstep(env: gym.Env, line: Line, travelling: Travelling, episode: int, seed: int) -> dict[str, Any]:
-    """One episode; time stands still until the controller has answered."""
+    """Play one episode; time stands still until the controller has answered."""
     obs, _ = env.reset(seed=seed)
     made, total, trace = {}, 0.0, []
-    action, told = np.zeros(env.action_space.shape, env.action_space.dtype), []
+    action, applied = np.zeros(env.action_space.shape, env.action_space.dtype), []
     for step in range(10**9):
         made[step] = obs
         trace.append(obs[:2])
         travelling.send(step)
         due = travelling.due(step)
         packets = [encode(OBSERVATION, episode, k, k, made[k]) for k in due]
-        packets += told
+        packets += applied
         packets.append(encode(TICK, episode, step, step, np.float64(due)))
         deadline, answer = time.monotonic() + PATIENCE, None
         while answer is None:
@@ -90,7 +90,7 @@ def lockstep(env: gym.Env, line: Line, travelling: Travelling, episode: int, see
             line.send(*packets)
             answer = line.action(episode, 0.5, range(step, step + 1))
         action = action if travelling.missed() else answer[1].astype(action.dtype)
-        told = [encode(APPLIED, episode, step, step, action)]
+        applied = [encode(APPLIED, episode, step, step, action)]
         obs, reward, terminated, truncated, _ = env.step(action)
         total += float(reward)
         if terminated or truncated:
@@ -99,7 +99,7 @@ def lockstep(env: gym.Env, line: Line, travelling: Travelling, episode: int, see
 
 
 def real_time(env: gym.Env, line: Line, travelling: Travelling, episode: int, seed: int) -> dict[str, Any]:
-    """One episode by the clock."""
+    """Play one episode in real time."""
     dt = env.unwrapped.dt
     obs, _ = env.reset(seed=seed)
     made, total, trace, held = {}, 0.0, [], 0
@@ -109,7 +109,7 @@ def real_time(env: gym.Env, line: Line, travelling: Travelling, episode: int, se
         made[step] = obs
         trace.append(obs[:2])
         travelling.send(step)
-        while True:  # until half of the step is over: deliver what arrives, take what comes back
+        while True:  # for half a step, deliver observations and receive actions
             now = (time.monotonic() - start) / dt
             for k in travelling.due(now):
                 line.send(encode(OBSERVATION, episode, k, start + k * dt, made[k]))
@@ -136,12 +136,12 @@ def real_time(env: gym.Env, line: Line, travelling: Travelling, episode: int, se
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="InvertedPendulum-v5")
-    parser.add_argument("--low", type=int, default=0, help="shortest travel of an observation, steps")
-    parser.add_argument("--high", type=int, default=0, help="longest")
+    parser.add_argument("--low", type=int, default=0, help="shortest travel of an observation, in steps")
+    parser.add_argument("--high", type=int, default=0, help="longest travel, in steps")
     parser.add_argument("--loss", type=float, default=0.0, help="probability that an observation is lost")
     parser.add_argument("--double", type=float, default=0.0, help="probability that it arrives twice")
     parser.add_argument("--missed", type=float, default=0.0, help="probability that a command is lost")
-    parser.add_argument("--first", type=int, default=0, help="travel of the first observation, steps")
+    parser.add_argument("--first", type=int, default=0, help="travel of the first observation, in steps")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, help="end episodes early")
     parser.add_argument("--seed", type=int, default=0)
@@ -157,7 +157,7 @@ def main() -> None:
         line.await_hello()
         for episode in range(1, given.episodes + 1):
             reset_seed = int(np.random.SeedSequence([given.seed, episode]).generate_state(1)[0] >> 1)
-            travelling = Travelling(link, [given.seed, episode], whole=not given.real_time)
+            travelling = Travelling(link, [given.seed, episode], whole_steps=not given.real_time)
             result = play(env, line, travelling, episode, reset_seed)
             result["trace"] = np.round(result["trace"][:TRACED], 4).tolist() if episode == 1 else None
             print(json.dumps({"episode": episode, "reset_seed": reset_seed} | result), flush=True)

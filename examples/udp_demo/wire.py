@@ -1,4 +1,4 @@
-"""Packets: a fixed head and numbers. Nothing in them can be executed, and what is malformed is dropped."""
+"""Packets: a fixed head, then numbers. They contain nothing executable, and malformed ones are dropped."""
 
 import struct
 from typing import NamedTuple
@@ -13,7 +13,7 @@ LONGEST = 1024  # numbers in a packet
 
 
 class Packet(NamedTuple):
-    """One datagram. `values`: an observation, an action, or of a tick the steps of the observations with it."""
+    """One datagram. `values` is an observation, an action, or for a tick the steps of its observations."""
 
     kind: int
     episode: int
@@ -23,13 +23,13 @@ class Packet(NamedTuple):
 
 
 def encode(kind: int, episode: int, step: int, stamp: float = 0.0, values: NDArray[np.floating] | tuple = ()) -> bytes:
-    """Bytes of a packet."""
+    """Return a packet as bytes."""
     numbers = np.asarray(values, "<f8")
     return HEAD.pack(MAGIC, kind, episode, step, stamp, len(numbers)) + numbers.tobytes()
 
 
 def decode(data: bytes) -> Packet | None:
-    """The packet, or None where it is none of ours."""
+    """Return the packet in the bytes, or None if they are not a packet."""
     if len(data) < HEAD.size:
         return None
     magic, kind, episode, step, stamp, count = HEAD.unpack_from(data)
