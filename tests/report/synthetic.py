@@ -1,4 +1,4 @@
-"""Made-up results, for the report's tests and for measuring it: `python tests/synthetic.py` writes such a report.
+"""Made-up results, for the report's tests and for measuring it: `python tests/report/synthetic.py OUT`.
 
 No number here was measured. Returns are a known function of agent, delay and step, with noise from the seed.
 """
@@ -12,51 +12,109 @@ from typing import Any
 import numpy as np
 
 from delayrl.report.report import report
-from delayrl.report.summary import Cell
+from delayrl.run.cell import Cell, Progress
+from delayrl.run.condition import Condition
 
 TASKS = ["Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Pusher", "Reacher", "Swimmer", "Walker2d"]
 QUALITY = {"vdpo": 1.1, "ad-sac": 1.0, "bpql": 0.95, "dida": 0.8, "dcac": 0.6, "a-sac": 0.4, "sac": 1.0, "random": 0.0}
 RANDOM, REFERENCE = -50.0, 4_000.0
+EVIL = "</script><script>alert(1)</script>"
+NASTY = [
+    EVIL,
+    "a|b `c` *d* [e](http://f)",
+    "<img src=x onerror=alert(1)>",
+    "{{data}}",
+    "$x^2$",
+    "two\nlines",
+    "<!--",
+    "\ud800",
+]
+
+Standing = tuple[Cell, Progress]
 
 
-def cell(agent: str, env: str, delay: int | str, seeds: int | tuple[int, ...] = 3, **changes: Any) -> Cell:
+def standing(
+    agent: str, env: str, delay: int | str, seeds: int | tuple[int, ...] = 3, id: str = "", state: Any = "done",
+    step: int | None = None, steps: int = 1_000_000, **changes: Any,
+) -> Standing:  # fmt: skip
+    """A cell and how far it is: at its end, unless `step` says otherwise."""
     seeds = tuple(range(seeds)) if isinstance(seeds, int) else seeds
-    values: dict[str, Any] = {
-        "id": f"{agent}-{env}-{delay}-{changes.get('overrides', '')}", "agent": agent, "env": env, "delay": delay,
-        "preset": "paper", "protocol": "corrected", "seeds": seeds, "overrides": {}, "status": "done",
-        "done": 1_000_000, "total": 1_000_000,
-    }  # fmt: skip
-    return Cell(**values | changes)
+    id = id or f"{agent}-{env}-{delay}-{changes.get('overrides', '')}"
+    condition = Condition(agent, env, delay, steps=steps, **changes)
+    return Cell(condition, seeds, id), Progress(state, steps if step is None else step)
 
 
-def rows(cells: Sequence[Cell], evaluations: int = 100, episodes: int = 10) -> Iterator[dict[str, Any]]:
-    """What the cells would have written up to `done`."""
-    for number, c in enumerate(cells):
-        for seed in c.seeds:
+def rows(cells: Sequence[Standing], evaluations: int = 100, episodes: int = 10) -> Iterator[dict[str, Any]]:
+    """What the cells would have written so far."""
+    for number, (cell, progress) in enumerate(cells):
+        condition, interval = cell.condition, cell.condition.steps // evaluations
+        for seed in cell.seeds:
             noise = np.random.default_rng([number, seed])
-            quality = QUALITY.get(c.agent, 0.5) * (0.97 ** (c.delay if isinstance(c.delay, int) else 5))
-            for step in range(c.total // evaluations, c.done + 1, c.total // evaluations):
-                learned = 1.0 if c.agent == "random" else 1 - np.exp(-5 * step / c.total)
+            delay = condition.delay if isinstance(condition.delay, int) else 5
+            quality = QUALITY.get(condition.agent, 0.5) * 0.97**delay
+            for step in range(interval, progress.step + 1, interval):
+                learned = 1.0 if condition.agent == "random" else 1 - np.exp(-5 * step / condition.steps)
                 mean = RANDOM + quality * learned * (REFERENCE - RANDOM) + 100 * noise.normal()
                 for episode in range(episodes):
-                    yield {
-                        "cell": c.id, "agent": c.agent, "env": c.env, "delay": c.delay, "preset": c.preset,
-                        "protocol": c.protocol, "privileged": c.agent in ("vdpo", "dida", "ad-sac"), "seed": seed,
+                    yield condition.columns | {
+                        "cell": cell.id, "privileged": condition.agent in ("vdpo", "dida", "ad-sac"), "seed": seed,
                         "step": step, "policy": "agent", "episode": episode, "reset_seed": 1,
                         "return": mean + float(episode), "length": 1000, "mujoco": "0.0.0",
                     }  # fmt: skip
 
 
-def full_grid(seeds: int = 10) -> list[Cell]:
+def row(of: Standing, seed: int, step: int, value: float, episode: int = 0, policy: str = "agent") -> dict[str, Any]:
+    """A row of a cell."""
+    columns = of[0].condition.columns
+    return columns | {
+        "cell": of[0].id, "seed": seed, "step": step, "policy": policy, "episode": episode, "return": value,
+        "privileged": columns["agent"] == "vdpo",
+    }  # fmt: skip
+
+
+def curve(of: Standing, seed: int, values: list[float], policy: str = "agent") -> list[dict[str, Any]]:
+    """An evaluation of two episodes, 5 above and 5 below the mean, every 100 steps."""
+    return [
+        row(of, seed, 100 * i, value + 5 - 10 * episode, episode, policy)
+        for i, value in enumerate(values, 1)
+        for episode in range(2)
+    ]
+
+
+def small(**changes: Any) -> dict[str, Standing]:
+    """An agent and its anchors, by agent."""
+    given = {"steps": 300, "seeds": 2} | changes
+    return {
+        "vdpo": standing("vdpo", "delayrl/Ant-v4", 5, **given),
+        "sac": standing("sac", "delayrl/Ant-v4", 0, **given),
+        "random": standing("random", "delayrl/Ant-v4", 0, **given),
+    }
+
+
+def anchored(cells: dict[str, Standing], **curves: list[list[float]]) -> list[dict[str, Any]]:
+    """Rows of the cells. Random: 0 and 20, so 10. Delay-free SAC ends at 100 and 120, so 110."""
+    curves = {"random": [[0.0] * 3, [20.0] * 3], "sac": [[0.0, 50, 100], [0.0, 50, 120]]} | curves
+    return [r for name, runs in curves.items() for seed, c in enumerate(runs) for r in curve(cells[name], seed, c)]
+
+
+def nasty() -> tuple[list[Standing], list[dict[str, Any]]]:
+    """Cells and rows whose names try to break out of the page."""
+    given: dict[str, Any] = {"preset": EVIL, "protocol": EVIL, "steps": 200}
+    cells = [standing(name, name, name, id=name, **given) for name in NASTY]
+    cells += [standing("random", name, 0, **given) for name in NASTY]
+    return cells, list(rows(cells, evaluations=2, episodes=1))
+
+
+def full_grid(seeds: int = 10, tasks: Sequence[str] = TASKS) -> list[Standing]:
     """The paper's: 9 tasks, 3 constant delays and a stochastic one, 6 agents; its ablation; and the anchors."""
     cells = []
-    for task in TASKS:
+    for task in tasks:
         env = f"delayrl/{task}-v4"
         for delay in (5, 25, 50, "paper-stochastic-5"):
-            cells += [cell(agent, env, delay, seeds) for agent in QUALITY if agent not in ("sac", "random")]
+            cells += [standing(agent, env, delay, seeds) for agent in QUALITY if agent not in ("sac", "random")]
         for representation in ("mlp", "transformer-no-belief"):
-            cells.append(cell("vdpo", env, 5, seeds, overrides={"representation": representation}))
-        cells += [cell("sac", env, 0, seeds), cell("random", env, 0, seeds)]
+            cells.append(standing("vdpo", env, 5, seeds, overrides={"representation": representation}))
+        cells += [standing("sac", env, 0, seeds), standing("random", env, 0, seeds)]
     return cells
 
 

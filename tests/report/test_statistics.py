@@ -104,7 +104,7 @@ def test_performance_profile_counts(scores: list[float], thresholds: list[float]
 
 
 def test_curves_share_their_steps() -> None:
-    steps, curves = s.common_steps([([10, 20, 30], [1, 2, 3]), ([10, 30, 40], [5, 6, 7])])
+    steps, curves = s.common_steps([{10: 1, 20: 2, 30: 3}, {30: 6, 10: 5, 40: 7}])
     assert steps.tolist() == [10, 30]
     assert curves.tolist() == [[1, 3], [5, 6]]
     steps, curves = s.common_steps([])

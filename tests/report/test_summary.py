@@ -1,0 +1,182 @@
+"""Results, anchors and aggregates, worked out by hand."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import anchored, curve, row, small, standing
+
+from delayrl.errors import DelayRLError
+from delayrl.report.markdown import markdown
+from delayrl.report.page import page
+from delayrl.report.results import Place, Result, Setting
+from delayrl.report.summary import Summary, summarise
+
+PAPER = Setting("corrected", "paper")
+
+
+def of(
+    summary: Summary, label: str, delay: int | str = 5, env: str = "delayrl/Ant-v4", setting: Setting = PAPER
+) -> Result:
+    return summary.results[Place(setting, env, delay, label)]
+
+
+def test_a_table_of_the_paper_by_hand() -> None:
+    cells = small()
+    summary = summarise(anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]]), [*cells.values()])
+    result = of(summary, "vdpo")
+    assert result.curves.steps.tolist() == [100, 200, 300]
+    assert result.random_anchor.value == 10
+    assert result.reference_anchor[:3] == (110, 2, "sac, no delay")
+    np.testing.assert_allclose(result.normalise(result.curves.final), [0.5, 1.5])
+    assert result.steps_to_threshold == 200  # mean 115; it falls to 110 after, and the first time counts
+    assert result.seeds_at_threshold == 2
+
+    normalised, steps = summary.tables
+    entry = normalised.entries["delayrl/Ant-v4", 5, "vdpo"]
+    assert (entry.value, entry.std) == (1.0, pytest.approx(math.sqrt(0.5)))
+    assert (entry.raw, entry.raw_std) == (110, pytest.approx(math.sqrt(5000)))
+    assert entry.published == ("2", 1.11, 0.04)
+    assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].published == (
+        "1",
+        420_000,
+        pytest.approx(math.nan, nan_ok=True),
+    )
+    (aggregate,) = summary.aggregates
+    assert (aggregate.iqm, aggregate.tasks, aggregate.runs) == (1.0, 1, 2)
+
+
+def test_without_anchors_there_are_raw_returns_and_nothing_else() -> None:
+    cells = small()
+    for missing in ("sac", "random"):
+        left = {name: c for name, c in cells.items() if name != missing}
+        every = anchored(cells, vdpo=[[0.0, 1, 2], [0.0, 1, 4]])
+        summary = summarise([r for r in every if r["agent"] != missing], [*left.values()])
+        entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
+        assert math.isnan(entry.value)
+        assert entry.raw == 3
+        assert not summary.aggregates
+
+
+def test_reference_rows_anchor_where_there_is_no_sac() -> None:
+    cells = small()
+    del cells["sac"]
+    inner = [r for seed in range(2) for r in curve(cells["vdpo"], seed, [0.0, 10, 210], "reference")]
+    every = anchored(cells | small(), vdpo=[[0.0, 0, 110], [0.0, 0, 110]])
+    summary = summarise([r for r in every if r["agent"] != "sac"] + inner, [*cells.values()])
+    result = of(summary, "vdpo")
+    assert result.reference_anchor[:3] == (210, 2, "the reference inside vdpo, Δ=5")
+    np.testing.assert_allclose(result.normalise(result.curves.final), [0.5, 0.5])
+    for table in summary.tables:  # not only below: the tables' heads promise the delay-free return
+        assert "Ret_df: the reference inside vdpo, Δ=5" in table.entries["delayrl/Ant-v4", 5, "vdpo"].note
+    assert "the reference inside vdpo" in markdown(summary, "t", {})
+
+
+@pytest.mark.parametrize("change", [{"protocol": "official"}, {"steps": 200}, {"preset": "small"}])
+def test_delay_free_sac_of_another_protocol_preset_or_budget_is_no_anchor(change: dict[str, Any]) -> None:
+    cells = small() | {"sac": standing("sac", "delayrl/Ant-v4", 0, 2, **{"steps": 300} | change)}
+    summary = summarise(anchored(cells, vdpo=[[0.0, 1, 2], [0.0, 1, 4]]), [*cells.values()])
+    assert math.isnan(of(summary, "vdpo").reference_anchor.value)
+
+
+def test_a_reference_that_is_worse_than_random_normalises_nothing() -> None:
+    cells = small()
+    curves = anchored(cells, sac=[[0.0, 0, 5], [0.0, 0, 5]], vdpo=[[0.0, 0, 50], [0.0, 0, 50]])
+    result = of(summarise(curves, [*cells.values()]), "vdpo")
+    assert np.isnan(result.normalise(result.curves.final)).all()
+
+
+def test_a_run_that_goes_on_is_not_compared_as_if_it_had_ended() -> None:
+    cells = small()
+    cells["vdpo"] = standing("vdpo", "delayrl/Ant-v4", 5, 2, steps=300, step=200, state="running")
+    summary = summarise(anchored(cells, vdpo=[[0.0, 100], [0.0, 100, 500]]), [*cells.values()])
+    assert of(summary, "vdpo").runs == 1  # the seed that has ended; the other is not mixed in
+    summary = summarise(anchored(cells, vdpo=[[0.0, 100], [0.0, 100]]), [*cells.values()])
+    result = of(summary, "vdpo")
+    assert result.partial
+    assert not summary.aggregates
+    entry = summary.tables[1].entries["delayrl/Ant-v4", 5, "vdpo"]
+    assert not entry.missed  # it may yet get there
+    assert "at 200 of 300 steps" in entry.note
+    assert "at 200 of 300 steps" in markdown(summary, "t", {})
+    ended = small()
+    summary = summarise(anchored(ended, vdpo=[[0.0, 1, 2], [0.0, 1, 2]]), [*ended.values()])
+    assert summary.tables[1].entries["delayrl/Ant-v4", 5, "vdpo"].missed
+
+
+def test_seeds_that_are_missing_are_told() -> None:
+    cells = small(seeds=3)
+    summary = summarise(anchored(cells, vdpo=[[0.0, 1, 60]]), [*cells.values()])
+    entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
+    assert entry.value == 0.5
+    assert math.isnan(entry.std)  # one seed
+    assert "1 of 3 seeds" in entry.note
+    assert math.isnan(summary.aggregates[0].low)
+
+
+def test_a_failed_seed_beside_one_that_has_ended() -> None:
+    """A cell of its own, as with lockstep = 1: it did not fail at the last step of the other."""
+    cells = small() | {"vdpo": standing("vdpo", "delayrl/Ant-v4", 5, seeds=(0,), steps=300)}
+    failed = standing("vdpo", "delayrl/Ant-v4", 5, seeds=(1,), id="1", steps=300, step=100, state="failed")
+    todo = standing("vdpo", "delayrl/Ant-v4", 5, seeds=(2,), id="2", steps=300, step=0, state="todo")
+    summary = summarise(anchored(cells, vdpo=[[0.0, 1, 60]]), [*cells.values(), failed, todo])
+    entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
+    assert entry.note == "1 of 3 seeds · failed at 100 of 300 steps"
+
+
+def test_over_all_delays_conditions_are_counted() -> None:
+    """Or an agent that was spared the long delays would look as if it had had them."""
+    longer = standing("vdpo", "delayrl/Ant-v4", 25, 2, steps=300)
+    cells = small() | {"bpql": standing("bpql", "delayrl/Ant-v4", 5, 2, steps=300)}
+    every = anchored(cells, vdpo=[[0.0, 0, 60], [0.0, 0, 60]], bpql=[[0.0, 0, 60], [0.0, 0, 60]])
+    every += curve(longer, 0, [0, 0, 30]) + curve(longer, 1, [0, 0, 30])
+    summary = summarise(every, [*cells.values(), longer])
+    counts = {(a.label, a.delay): (a.tasks, a.runs) for a in summary.aggregates}
+    assert counts == {
+        ("bpql", 5): (1, 2),
+        ("vdpo", 5): (1, 2),
+        ("vdpo", 25): (1, 2),
+        ("bpql", None): (1, 2),
+        ("vdpo", None): (2, 4),
+    }
+    assert "2 conditions, 4 runs" in markdown(summary, "t", {})
+
+
+def test_cells_that_share_all_but_their_seeds_are_one_and_others_are_not_mixed() -> None:
+    cells = small()
+    more = standing("vdpo", "delayrl/Ant-v4", 5, id="more", seeds=(7,), steps=300)
+    other = standing("vdpo", "delayrl/Ant-v4", 5, 2, id="wide", overrides={"width": 64}, steps=300)
+    every = anchored(cells, vdpo=[[0.0, 0, 10], [0.0, 0, 20]]) + curve(more, 7, [0, 0, 30])
+    every += curve(other, 0, [0, 0, 1000]) + curve(other, 1, [0, 0, 1000])
+    summary = summarise(every, [*cells.values(), more, other])
+    assert of(summary, "vdpo").curves.final.tolist() == [10, 20, 30]
+    assert of(summary, "vdpo width=64").curves.final.tolist() == [1000, 1000]
+    assert [t.title for t in summary.tables if t.kind == "ablation"] == ["Ablation of vdpo"]
+    again = standing("vdpo", "delayrl/Ant-v4", 5, 2, id="~twice", steps=300)
+    summary = summarise(every + curve(again, 0, [0, 0, 5]), [*cells.values(), more, again, other])
+    assert of(summary, "vdpo").curves.final.tolist() == [10, 20, 30]
+    assert of(summary, "vdpo #~twice").curves.final.tolist() == [5]
+
+
+def test_order_of_rows_does_not_matter() -> None:
+    cells = small()
+    every = anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]])
+    mixed = [every[i] for i in np.random.default_rng(0).permutation(len(every))]
+    pages = [page(summarise(some, [*cells.values()]), "t") for some in (every, mixed)]
+    assert pages[0] == pages[1]
+
+
+def test_rows_of_no_cell_are_counted() -> None:
+    cells = small()
+    stray = standing("bpql", "Ant-v4", 5, id="gone")
+    summary = summarise(anchored(cells) + curve(stray, 0, [1]), [*cells.values()])
+    assert summary.unplaced == 2
+    assert "2 rows belong to no cell" in markdown(summary, "t", {})
+
+
+def test_rows_of_two_things_under_one_cell() -> None:
+    c = standing("bpql", "Ant-v4", 5)
+    rows = [row(c, 0, 100, 1.0), row(c, 0, 200, 1.0) | {"env": "Hopper-v4"}]
+    with pytest.raises(DelayRLError, match=r"rows of cell .* are of different things"):
+        summarise(rows, [c])

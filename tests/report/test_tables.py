@@ -1,0 +1,51 @@
+"""Tables in the paper's layout, and the paper's values beside ours."""
+
+import math
+
+from synthetic import anchored, small, standing
+
+from delayrl.report.summary import summarise
+from delayrl.report.tables import published_values
+
+
+def test_columns_that_were_not_run_are_empty_beside_the_papers_value() -> None:
+    cells = small()
+    summary = summarise(anchored(cells), [*cells.values()])
+    table = summary.tables[0]
+    assert table.columns == ["a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo"]
+    entry = table.entries["delayrl/Ant-v4", 5, "bpql"]
+    assert math.isnan(entry.value)
+    assert math.isnan(entry.raw)
+    assert entry.published == ("2", 0.96, 0.03)
+
+
+def test_ablation_meets_the_papers_columns() -> None:
+    chosen = [standing("vdpo", "Ant-v4", 5, overrides={"representation": r}) for r in ("mlp", "transformer-no-belief")]
+    summary = summarise([], [*chosen, standing("vdpo", "Ant-v4", 5), standing("vdpo", "Ant-v4", 25)])
+    (table,) = [t for t in summary.tables if t.kind == "ablation"]
+    assert table.rows == [("Ant-v4", 5)]
+    published = {c: table.entries["Ant-v4", 5, c].published for c in table.columns}
+    assert {label: value[:2] for label, value in published.items() if value} == {
+        "vdpo": ("3", 1.11),
+        "vdpo representation=mlp": ("3", 0.86),
+        "vdpo representation=transformer-no-belief": ("3", 1.09),
+    }
+
+
+def test_stochastic_delays_have_their_table() -> None:
+    summary = summarise(
+        [], [standing("vdpo", "delayrl/Walker2d-v4", "paper-stochastic-5"), standing("bpql", "X", "walk:8")]
+    )
+    (table,) = summary.tables
+    assert table.kind == "stochastic"
+    assert table.entries["delayrl/Walker2d-v4", "paper-stochastic-5", "vdpo"].published.table == "4"  # type: ignore[union-attr]
+    assert table.entries["X", "walk:8", "bpql"].published is None
+
+
+def test_published_values() -> None:
+    values = published_values()
+    assert len(values) == 162 + 162 + 27 + 54
+    assert values["normalised", "Walker2d-v4", "50", "bpql", ""] == ("2", 0.23, 0.10)
+    assert values["steps", "Ant-v4", "5", "vdpo", ""].value == 420_000
+    assert math.isnan(values["steps", "Ant-v4", "5", "bpql", ""].value)
+    assert values["steps", "Ant-v4", "5", "bpql", ""].table == "1"
