@@ -126,7 +126,7 @@ def test_equal_delays_are_a_sac() -> None:
     expected, metrics = agent.learner.update(one, windows, key, jnp.int32(1))
 
     target_key, actor_key = jax.random.split(key)
-    draw, redraw = jax.random.split(jax.random.split(actor_key, 1)[0])
+    policy_key, temperature_key = jax.random.split(jax.random.split(actor_key, 1)[0])
     now, later = agent.inputs(windows, 0), agent.inputs(windows, windows.n_step)
     value, entropies = agent.next_value(state, later, target_key, target_key)
     auxiliary, of_critic = agent.learner.learn_critic(state.auxiliary, windows, now.auxiliary, value)
@@ -134,10 +134,10 @@ def test_equal_delays_are_a_sac() -> None:
     assert same((of_critic["critic_loss"], entropies["entropy"]), (metrics["critic_loss"], metrics["entropy"]))
     assert same((auxiliary.critic, auxiliary.target), (expected.critic, expected.target))
 
-    short = agent.improve_auxiliary(state, now, draw)
+    short = agent.improve_auxiliary(state, now, policy_key)
     assert same(short._replace(auxiliary=auxiliary), state)
-    near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, redraw), expected)
-    long = agent.improve_augmented(state, now, draw)
+    near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, SPEC.action_size, temperature_key), expected)
+    long = agent.improve_augmented(state, now, policy_key)
     assert same(long.auxiliary, auxiliary)
     near((long.actor, long.actor_opt_state), (expected.actor, expected.actor_opt_state))
     assert same((long.actor, long.actor_opt_state), (short.auxiliary.actor, short.auxiliary.actor_opt_state))
