@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot
 from speed import tables as speed
 
-from delayrl.cli.bench import bench
+from delayrl.cli.main import main as delayrl
 
 HERE = Path(__file__).parent
 COLOURS = {
@@ -217,7 +217,7 @@ def insert(page: Path, key: str, text: str) -> None:
 def first(root: Path) -> str:
     """Write the report of the grid `first` to docs/results and return the part that the README shows."""
     folder = root / "docs" / "results"
-    bench(["report", str(HERE / "results" / "first.sqlite"), "--out", str(folder)])
+    delayrl(["bench", "report", str(HERE / "results" / "first.sqlite"), "--out", str(folder)])
     text = (folder / "report.md").read_text()
     made = next(line for line in text.splitlines() if line.startswith("Made on"))
     curves = "![Learning curves](docs/results/img/curves-0-0.png)"
