@@ -1,5 +1,5 @@
 #!/bin/bash
-# A Slurm of one node in a folder of its own: `slurm_node.sh FOLDER PORT PORT`, until its stdin closes. Needs slurm-wlm and munge.
+# Run a Slurm with one node in a folder until stdin closes: `slurm_node.sh FOLDER PORT PORT`. Needs slurm-wlm and munge.
 set -e
 home=$1
 host=$(hostname -s)

@@ -1,4 +1,4 @@
-"""Grids: what a TOML file stands for, and what is refused."""
+"""Grids: which cells a TOML file stands for, and which files are refused."""
 
 import json
 from dataclasses import replace
@@ -54,7 +54,7 @@ def ids(folder: Path, text: str) -> set[str]:
 
 
 def test_the_id_is_the_configuration(tmp_path: Path) -> None:
-    """Not how it is written: order, defaults spelled out, where an override stands. Anything else changes it."""
+    """Order, spelled-out defaults and the place of an override do not change ids; anything else does."""
     first = ids(tmp_path, BASIC)
     assert first == ids(tmp_path, "\n".join(reversed(BASIC.splitlines())))
     assert first == ids(tmp_path, BASIC.replace("seeds = 2", "seeds = [0, 1]").replace("[2, 3]", "[3.0, 2]"))
@@ -70,7 +70,7 @@ def test_the_id_is_the_configuration(tmp_path: Path) -> None:
 
 
 def test_ids_stay(tmp_path: Path) -> None:
-    """Runs are found by them: an id that changes where no option or default of `random` did is a defect."""
+    """An id that changes although no option or default of `random` did is a defect: runs would be lost."""
     text = 'preset = "small"\nagents = ["random"]\ntasks = ["Reacher-v5"]\ndelays = [0]\n'
     assert load_grid(write(tmp_path, text)).ids == ["b39efaf6cbf4"]
 
@@ -78,7 +78,7 @@ def test_ids_stay(tmp_path: Path) -> None:
 @settings(max_examples=20, deadline=None)
 @given(seeds=st.integers(1, 7), lockstep=st.integers(1, 9), first=st.integers(0, 5))
 def test_lockstep_groups(seeds: int, lockstep: int, first: int, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Every seed once, in groups of at most so many."""
+    """Every seed is in one group, and no group exceeds the limit."""
     numbers = list(range(first, first + seeds))
     text = f'preset = "small"\nagents = ["random"]\ntasks = ["Reacher-v5"]\ndelays = [0]\nseeds = {numbers}\n'
     grid = load_grid(write(tmp_path_factory.mktemp("grid"), text + f"lockstep = {lockstep}\n"))
@@ -138,7 +138,7 @@ def test_shipped_grids(name: str) -> None:
 
 
 def test_grids_of_the_paper() -> None:
-    """Its tables' cells, ten seeds, its preset unchanged; runs that tables share are one."""
+    """The cells of its tables, with ten seeds and its preset; tables share runs."""
     table = load_grid("paper-table2")
     conditions = [cell.condition for cell in table.cells]
     delayed = {(c.env, c.delay, c.agent) for c in conditions if c.delay}
@@ -207,7 +207,7 @@ BAD = [
 
 @pytest.mark.parametrize(("text", "words"), BAD)
 def test_bad_grids(text: str, words: str, tmp_path: Path, monkeypatch, capsys) -> None:
-    """One line, exit status 2, nothing made."""
+    """A bad grid is one line and exit status 2, and leaves no files."""
     file = write(tmp_path, text)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as end:
@@ -221,7 +221,7 @@ def test_bad_grids(text: str, words: str, tmp_path: Path, monkeypatch, capsys) -
 
 
 def test_two_grids_of_one_name(tmp_path: Path) -> None:
-    """Refused where their results would mix; an edited file, and a copy of it, keep the name."""
+    """The second is refused if results would mix; an edited file, and a copy of it, keep the name."""
     runs = tmp_path / "runs"
     (tmp_path / "other").mkdir()
     mine, theirs = (

@@ -1,4 +1,4 @@
-"""Ray: the same cells, on nodes that may die. Skipped where Ray is not installed."""
+"""Ray: cells on nodes that may die. Skipped where Ray is not installed."""
 
 import math
 import os
@@ -39,7 +39,7 @@ def test_without_ray(monkeypatch) -> None:
     [("nowhere", "HOST:PORT"), ("localhost:0", "no Ray cluster at localhost:0"), ("192.0.2.1:6379", "192.0.2.1:6379")],
 )
 def test_an_address_that_does_not_answer(address: str, words: str) -> None:
-    """One line, within seconds."""
+    """It fails with one line, within seconds."""
     began = time.monotonic()
     with pytest.raises(delayrl.DelayRLError, match=words) as error:
         connect(address)
@@ -50,7 +50,7 @@ def test_an_address_that_does_not_answer(address: str, words: str) -> None:
 @needs_ray
 @pytest.mark.slow
 def test_an_address_that_is_not_rays(tmp_path: Path) -> None:
-    """Something listens there, and says nothing. In a process of its own, which ends."""
+    """A server listens there but never answers: the command ends with one line."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
         command = [
@@ -81,7 +81,7 @@ def test_cores_that_cannot_be(cpus: float, gpus: float, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_more_than_the_cluster_has(tmp_path: Path) -> None:
-    """One line; it would wait for ever."""
+    """It fails with one line instead of waiting for ever."""
     with pytest.raises(delayrl.DelayRLError, match=r"a cell takes 1 cores and 99 GPUs .* has \d+ and \d+$"):
         RayBackend(tmp_path, None, None, 1.0, 99.0)
     assert not ray.is_initialized()
@@ -97,7 +97,7 @@ def test_a_folder_that_the_node_does_not_see(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_node_is_killed(tmp_path: Path) -> None:
-    """Two simulated nodes with one core each, one dies in the middle of a cell: its cell goes on at the other."""
+    """Of two simulated nodes with a core each, one dies: its cell is resumed on the other."""
     from ray.cluster_utils import Cluster
 
     file = tiny(tmp_path, steps=3000)
@@ -139,7 +139,7 @@ def test_a_node_is_killed(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_time_limit(tmp_path: Path) -> None:
-    """On a cluster of its own: stopped at checkpoints, and nothing is left running."""
+    """On a local cluster the cells stop at checkpoints, and nothing is left running."""
     grid, runs = load_grid(tiny(tmp_path, steps=60_000)), tmp_path / "runs"
     completion = run_cells(grid.cells, runs, RayBackend(runs, None), time_limit=40)
     assert len(completion.unfinished) == 2

@@ -1,4 +1,4 @@
-"""Rows of a grid and the table that is published: nothing lost, nothing twice, what was used to make them."""
+"""Rows of a grid and the published table: none lost, none twice, with the versions that made them."""
 
 import json
 import sqlite3
@@ -42,7 +42,7 @@ protocol = "official"
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Grid, Path]:
-    """A grid with one cell done, worked on in this process, and one not begun."""
+    """A grid with one cell that was trained in this process, and one that has not begun."""
     home = tmp_path_factory.mktemp("finished")
     grid = load_grid(tiny(home, text=MIXED, name="mixed"))
     assert work_on(grid.cells[0], home / "runs") == Outcome("done", "")
@@ -55,7 +55,7 @@ def work_on(cell: Cell, runs: Path) -> Outcome:
 
 
 def test_round_trip(finished, tmp_path: Path) -> None:
-    """The table gives back the rows of the folders, exactly; of cells not begun it says so."""
+    """A table returns exactly the rows of the folders, and lists cells that have not begun."""
     grid, runs = finished
     expected = list(rows_of(grid.cells[:1], runs))
     assert len(expected) == 2 * 2 * 2
@@ -79,7 +79,7 @@ def test_the_same_rows_give_the_same_bytes(finished, tmp_path: Path) -> None:
 
 
 def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> None:
-    """Unknown columns come back, whether they hold for the run or differ; every version that worked on it is named."""
+    """A table keeps unknown columns, constant or not, and the versions of every start."""
     grid, runs = finished
     cell = replace(grid.cells[0], id="0123")
     run = Run(runs / cell.folder / "seed0")
@@ -114,7 +114,7 @@ def test_committed_tables(table: str, grid: str | Path, count: int) -> None:
 
 
 def test_plain_sql(finished, tmp_path: Path) -> None:
-    """Somebody without this library reads it."""
+    """The table can be read without this library."""
     grid, runs = finished
     collect(grid, runs, tmp_path / "t.sqlite")
     table = sqlite3.connect(tmp_path / "t.sqlite")
@@ -127,7 +127,7 @@ def test_plain_sql(finished, tmp_path: Path) -> None:
 
 
 def test_bad_tables(finished, tmp_path: Path) -> None:
-    """One line each, and what was there stays."""
+    """Each fails with one line and leaves the file as it was."""
     grid, runs = finished
     file = tmp_path / "t.sqlite"
     with pytest.raises(delayrl.DelayRLError, match="there is no table"):
@@ -168,7 +168,7 @@ def test_an_episode_twice(finished, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("change", ["{}", "5", '"step": null', '"return": NaN', '"return": "1"'])
 def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
-    """One line, from the report and before anything is published."""
+    """Reading and collecting fail with one line, and no table is written."""
     grid, runs = finished
     cell = replace(grid.cells[0], id="5678")
     run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
@@ -187,7 +187,7 @@ def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
 
 
 def test_worker(finished, tmp_path: Path) -> None:
-    """A finished cell is left alone; a held one too; a mistake is one line, and the cell's state."""
+    """The worker leaves finished and locked cells alone; an error is one line."""
     grid, runs = finished
     home = runs / grid.cells[0].folder
     before = (home / "journal.jsonl").read_text()
@@ -208,7 +208,7 @@ def test_worker(finished, tmp_path: Path) -> None:
 
 
 def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
-    """plan, status and collect as they are typed."""
+    """Plan, status and collect on the command line."""
     grid, runs = finished
     words = [str(grid.source), "--runs", str(runs)]
     main(["bench", "plan", *words])
@@ -230,7 +230,7 @@ def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
 
 
 def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkeypatch) -> None:
-    """Not by hundreds of numbers."""
+    """The label stands for hundreds of numbers."""
     monkeypatch.chdir(tmp_path)
     Path("log.csv").write_text("\n".join("1234" * 100))
     file = tiny(tmp_path, text=MIXED.replace("delays = [2]", 'delays = ["recorded:log.csv"]'), name="recorded")
@@ -276,7 +276,7 @@ def test_bad_commands(words: str, expected: str, tmp_path: Path, monkeypatch, ca
 
 
 def test_commit(tmp_path: Path, monkeypatch) -> None:
-    """That of our checkout, marked where it was changed; not that of a project that has us in its environment."""
+    """Our checkout's commit, marked if files changed; not that of a project with us in its environment."""
 
     def git(*words: str) -> str:
         author = ("-c", "user.name=a", "-c", "user.email=a@b")
@@ -314,7 +314,7 @@ def test_commit(tmp_path: Path, monkeypatch) -> None:
     ],
 )
 def test_a_table_with_wrong_types(finished, tmp_path: Path, column: str, value: str, capsys) -> None:
-    """It may be from anywhere: one line."""
+    """A damaged table fails with one line."""
     grid, runs = finished
     file = tmp_path / "t.sqlite"
     collect(grid, runs, file)

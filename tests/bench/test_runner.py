@@ -40,7 +40,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[
 
 
 def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int, within: float) -> int:
-    """Run a grid, killing workers at random, some seconds apart; how many were killed."""
+    """Run a grid and kill random workers, some seconds apart. Returns how many were killed."""
     cells, rng, killed = load_grid(file).cells, random.Random(kills), 0
     process = bench("run", file, "--runs", runs, "--workers", workers, "--tries", kills + 1, cache=cache)
     try:
@@ -61,13 +61,13 @@ def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int, within:
 
 
 def ends(runs: Path, file: Path) -> list[int]:
-    """How often each cell's journal says that it was finished."""
+    """Return how often each cell's journal notes its end."""
     cells = load_grid(file).cells
     return [sum(e["event"] == "done" for e in folders.journal(runs / cell.folder)) for cell in cells]
 
 
 def test_workers_killed(undisturbed, tmp_path: Path, cache: Path) -> None:
-    """Every cell ends once, no row is lost or double, results are those of the undisturbed grid."""
+    """Every cell ends once, with the rows and parameters of the undisturbed grid."""
     file, expected = undisturbed
     assert chaos(file, tmp_path / "runs", cache, kills=2, workers=2, within=1) == 2
     assert_same_results(file, tmp_path / "runs", expected)
@@ -91,11 +91,11 @@ def test_finished_cells_are_skipped(undisturbed, cache: Path) -> None:
 
 
 def test_time_limit(tmp_path: Path, cache: Path) -> None:
-    """Stopped at a checkpoint, status 75, nothing holds the cells; the same command goes on from there."""
+    """The grid stops at a checkpoint with status 75 and releases its cells; the same command resumes it."""
     file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
     cells, reached = load_grid(file).cells, 0
     for advances in range(2):
-        for _ in range(6):  # on a slow machine compiling takes the whole time
+        for _ in range(6):  # on a slow machine compiling takes all the time
             said = finish(bench("run", file, "--runs", runs, "--time-limit", "10s", cache=cache), 75)
             assert "0 of 2 cells done" in said
             assert "the same command resumes it" in said
@@ -111,7 +111,7 @@ def test_time_limit(tmp_path: Path, cache: Path) -> None:
 
 
 def test_stopped_or_killed_runner(undisturbed, tmp_path: Path, cache: Path) -> None:
-    """SIGTERM stops the workers with it; when the runner is killed, its workers notice and store a checkpoint."""
+    """Its workers store a checkpoint in both cases."""
     file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
     cell = load_grid(file).cells[0]
     for kind, status in ((signal.SIGTERM, 75), (signal.SIGKILL, -signal.SIGKILL)):
@@ -133,7 +133,7 @@ def until(condition, timeout: float = 120) -> None:
 
 
 def test_two_runners(undisturbed, tmp_path: Path, cache: Path) -> None:
-    """Side by side on one grid: each cell is begun once and finished once, both runners end well."""
+    """Two runners share a grid: each cell begins and ends once, and both runners succeed."""
     file, runs = tiny(tmp_path), tmp_path / "runs"
     both = [bench("run", file, "--runs", runs, cache=cache) for _ in range(2)]
     assert all("2 of 2 cells done" in finish(process) for process in both)
@@ -152,7 +152,7 @@ exit $status
 
 
 def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
-    """A real one. One line, and not tried again; with room the grid goes on, and no row is lost or double."""
+    """A full disk fails with one line and is not tried again; with room the grid resumes without loss."""
     file, expected = undisturbed
     if subprocess.run(["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode:
         pytest.skip("no file system can be mounted here")
@@ -190,7 +190,7 @@ def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
 
 
 class Script:
-    """A backend whose cells end as they are told."""
+    """A backend whose cells end as scripted."""
 
     def __init__(self, **outcomes: list[Outcome]):
         self.outcomes, self.running, self.started = outcomes, list[Cell](), list[str]()
@@ -223,11 +223,11 @@ def short_pause(monkeypatch) -> None:
 
 
 def test_tries_are_bounded(tmp_path: Path) -> None:
-    """Only those in a row that store nothing new count; a mistake is not tried again; the others go on."""
+    """Only tries in a row that store nothing new count; errors are not tried again; other cells continue."""
     backend = Script(sac=[DIED] * 9, bpql=[DIED, DIED, DONE], vdpo=[WRONG, DONE])
     began = time.monotonic()
     completion = run_cells(cells("sac", "bpql", "vdpo"), tmp_path, backend, tries=3)
-    assert time.monotonic() - began > 2 + 4  # longer from time to time
+    assert time.monotonic() - began > 2 + 4  # the wait grows
     assert [backend.started.count(agent) for agent in ("sac", "bpql", "vdpo")] == [3, 3, 1]
     assert [cell.condition.agent for cell in completion.done] == ["bpql"]
     assert completion.failed == {
@@ -241,7 +241,7 @@ def test_tries_are_bounded(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_cannot_be_started(tmp_path: Path) -> None:
-    """Its cell has failed, the others go on."""
+    """Its cell fails, the others continue."""
 
     class Refuses(Script):
         def start(self, cell: Cell) -> None:
@@ -272,7 +272,7 @@ def test_a_cell_of_another_runner_is_waited_for(tmp_path: Path) -> None:
 
 
 def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
-    """Or the log of the worker that holds it would be emptied, again and again."""
+    """Starting a worker would empty the log of the worker that holds the cell."""
     backend, some = Script(sac=[DONE], bpql=[DONE]), cells("sac", "bpql")
     folders.prepare(tmp_path / some[0].folder, some[0])
     with contextlib.ExitStack() as held:
@@ -290,7 +290,7 @@ def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
 
 
 def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> None:
-    """After the grace, so that a queue's wall-clock limit holds."""
+    """They are killed after the grace period, so that a queue's time limit holds."""
     sleep = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
 
     def start(folder: Path, device: str | None) -> subprocess.Popen:
@@ -304,7 +304,7 @@ def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> Non
 
 
 def test_journal_after_a_crash(tmp_path: Path) -> None:
-    """A line that was cut off does not swallow the next one."""
+    """A line that was cut off does not damage the next."""
     folders.note(tmp_path, "begun")
     with open(tmp_path / "journal.jsonl", "a") as file:
         file.write('{"event": "do')
@@ -315,7 +315,7 @@ def test_journal_after_a_crash(tmp_path: Path) -> None:
 
 
 def test_lock(tmp_path: Path) -> None:
-    """One holder; gone with its process; looking does not take it."""
+    """A lock has one holder and ends with its process; `holder` does not take it."""
     assert folders.holder(tmp_path) is None
     code = f"from delayrl.bench.folders import *\nwith hold(Path({str(tmp_path)!r})): print(1, flush=True); input()"
     with subprocess.Popen(
@@ -333,7 +333,7 @@ def test_lock(tmp_path: Path) -> None:
 
 
 def test_time_left(tmp_path: Path) -> None:
-    """At the speed of the same agent on the same task, else of the agent, else of all."""
+    """Estimated with the speed of the same agent on the same task, else of the agent, else of all."""
     some = cells("sac", "bpql", "vdpo")
     states = [("done", 100, 10.0), ("running", 50, 5.0), ("todo", 0, None)]
     now = [(cell, Progress(*state)) for cell, state in zip(some, states, strict=True)]

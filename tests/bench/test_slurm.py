@@ -1,4 +1,4 @@
-"""Slurm: the script, and a real Slurm of one node. Skipped where slurm-wlm and munge are not installed."""
+"""Slurm: the script, and a real Slurm with one node. Skipped where slurm-wlm and munge are not installed."""
 
 import os
 import re
@@ -27,7 +27,7 @@ needs_slurm = pytest.mark.skipif(
 
 
 def test_script(tmp_path: Path) -> None:
-    """An array with one element for each cell, in bash, with room between stopping and the queue's limit."""
+    """The script is valid bash: one array element for each cell, with time to stop before the queue's limit."""
     grid = load_grid(tiny(tmp_path))
     text = script(grid, grid.cells, tmp_path / "my runs", time_limit=600, options=["--partition=gpu"])
     assert "#SBATCH --array=0-1\n" in text
@@ -43,7 +43,7 @@ def test_script(tmp_path: Path) -> None:
 
 
 def test_written_for_another_machine(tmp_path: Path, capsys, monkeypatch) -> None:
-    """Without --submit nothing is submitted; without sbatch one line says so; finished cells are left out."""
+    """Without --submit nothing is submitted; a missing sbatch is one line; finished cells are skipped."""
     file = tiny(tmp_path)
     words = ["bench", "run", str(file), "--runs", str(tmp_path / "runs"), "--backend", "slurm"]
     main(words)
@@ -59,10 +59,10 @@ def test_written_for_another_machine(tmp_path: Path, capsys, monkeypatch) -> Non
 
 @pytest.fixture
 def node(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """The environment in which commands of Slurm reach a node of our own."""
+    """Start a Slurm with one node. Yields the environment in which its commands reach it."""
     home = tmp_path / "slurm"
-    with socket.create_server(("", 0)) as one, socket.create_server(("", 0)) as other:
-        ports = [str(server.getsockname()[1]) for server in (one, other)]
+    with socket.create_server(("", 0)) as control, socket.create_server(("", 0)) as worker:
+        ports = [str(server.getsockname()[1]) for server in (control, worker)]
     process = subprocess.Popen(
         [NODE, home, *ports], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -82,7 +82,7 @@ def node(tmp_path: Path) -> Iterator[dict[str, str]]:
 @needs_slurm
 @pytest.mark.slow
 def test_a_real_slurm(node: dict[str, str], tmp_path: Path, monkeypatch) -> None:
-    """Cut by the time limit and by a signal, queued again each time, and the same results in the end."""
+    """A job that the time limit and a signal stop is requeued each time, and the results are the same."""
     file, runs = tiny(tmp_path, steps=3000), tmp_path / "runs"
     finish(bench("run", file, "--runs", tmp_path / "expected", cache=tmp_path / "cache"))
     for name in ("SLURM_CONF", "JAX_COMPILATION_CACHE_DIR"):

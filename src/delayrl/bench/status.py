@@ -110,7 +110,7 @@ def table(standing: Standing) -> list[list[str]]:
 
 
 def closing_lines(name: str, standing: Standing, workers: int) -> list[str]:
-    """Return what stands below the table: the grid of this name in one line, then one line for each failure."""
+    """Return the lines below the table: the standing of the grid, and its failures."""
     failures = [f"failed: {cell} ({cell.id}): {p.line}" for cell, p in standing if p.state == "failed"]
     return [f"{name}: {line(standing, workers)}", *failures]
 
