@@ -1,4 +1,4 @@
-"""The same action from JAX, NumPy, ONNX and C++: every agent, every age, random inputs."""
+"""JAX, NumPy, ONNX and C++ compute the same action: every agent, every age, random inputs."""
 
 import json
 import math
@@ -28,7 +28,7 @@ REPEATS = 5
 def controller(tmp_path_factory: pytest.TempPathFactory) -> str:
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
-        assert not os.environ.get("CI"), "there is no C++ compiler"  # there the comparison must be made
+        assert not os.environ.get("CI"), "there is no C++ compiler"  # in CI the comparison must be made
         pytest.skip("there is no C++ compiler")
     program = tmp_path_factory.mktemp("cpp") / "controller"
     flags = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
@@ -44,7 +44,7 @@ def ask(controller: str, bundle: Path, inputs: list) -> np.ndarray:
 
 
 def random_inputs(policy: Policy, ages) -> list:
-    """Histories are full of actions whatever the age: those after the first `age` must not matter."""
+    """Sample inputs. Histories are full of actions at any age: those after the first `age` must not matter."""
     random = np.random.default_rng(1)
     shape = (policy.spec.delay, policy.spec.action_size)
     return [
@@ -80,16 +80,16 @@ def test_backends_agree(name: str, tmp_path: Path, request: pytest.FixtureReques
     assert ((expected - policy.low) / width).std(0).max() > 0.1  # agreement on a constant would show little
     for backend in ("numpy", "onnx", "jax"):
         bundle = load_bundle(path, backend)
-        found = np.array([bundle(*given) for given in inputs])
-        assert found.dtype == np.float32
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5, err_msg=backend)
-    found = ask(request.getfixturevalue("controller"), path, inputs)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+        actual = np.array([bundle(*given) for given in inputs])
+        assert actual.dtype == np.float32
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5, err_msg=backend)
+    actual = ask(request.getfixturevalue("controller"), path, inputs)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["vdpo", "bpql"])
 def test_preset_paper_agrees(name: str, tmp_path: Path, controller: str) -> None:
-    """Widths and depth as they are used, at HalfCheetah's sizes and Δ = 25."""
+    """The widths and depth of the preset, at HalfCheetah's sizes and Δ = 25."""
     agent, spec = REGISTRY[name].presets["paper"].agent, Spec(17, 6, 25)
     policy = Policy(agent, random_state(agent, spec), spec, -np.ones(6), np.ones(6))
     path = bundle_of(tmp_path / "bundle", policy)
@@ -118,7 +118,7 @@ def test_what_stands_after_the_age_is_not_read(backend: str, tmp_path: Path) -> 
 
 
 def test_log_std_is_left_out() -> None:
-    """Half of the last layer's outputs; DIDA's student has none to leave out."""
+    """The log-std is half of the last layer's outputs; DIDA's student has none."""
     for name in ("bpql", "dida"):
         network, arrays = network_of(policy_of(name))
         last = f"head.{len(network.hidden)}.b"
@@ -157,7 +157,7 @@ except ImportError:
 
 def test_controller_in_cpp_refuses(controller: str, tmp_path: Path) -> None:
     path = bundle_of(tmp_path / "bundle", policy_of("bpql"))
-    whole = (path / "policy.safetensors").read_bytes()
+    weights = (path / "policy.safetensors").read_bytes()
     document = (path / "bundle.json").read_text()
 
     def refused(*words: str) -> str:
@@ -169,10 +169,10 @@ def test_controller_in_cpp_refuses(controller: str, tmp_path: Path) -> None:
 
     assert "usage" in refused()
     assert "cannot read" in refused(str(tmp_path / "nowhere"))
-    for broken in (whole[:500], b"", b"\x80\x04." * 100, (1 << 62).to_bytes(8, "little") + whole[8:]):
+    for broken in (weights[:500], b"", b"\x80\x04." * 100, (1 << 62).to_bytes(8, "little") + weights[8:]):
         (path / "policy.safetensors").write_bytes(broken)
         refused(str(path))
-    (path / "policy.safetensors").write_bytes(whole)
+    (path / "policy.safetensors").write_bytes(weights)
     for broken in ("", "{", "[" * 10_000, document.replace('"obs_size": 10', '"obs_size": 1e300')):
         (path / "bundle.json").write_text(broken)
         refused(str(path))

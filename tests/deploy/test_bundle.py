@@ -1,4 +1,4 @@
-"""A bundle may come from anybody: broken and malicious ones are one line, nothing runs, nothing is written."""
+"""A bundle may come from anybody: broken and malicious ones give a one-line error; nothing runs or is written."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def refused(path: Path, words: str, backend: str = "numpy") -> None:
 
 
 def forge(bundle: Path, change: Callable[[dict[str, Any]], Any] | None = None, **files: bytes) -> None:
-    """What somebody else can write: a bundle that was changed, with sums that are right."""
+    """Write what an attacker can write: a changed bundle with valid checksums."""
     document = json.loads((bundle / DOCUMENT).read_text())
     if change is not None:
         change(document)
@@ -52,11 +52,11 @@ def forge(bundle: Path, change: Callable[[dict[str, Any]], Any] | None = None, *
         (bundle / name).write_bytes(data)
 
 
-def test_whole_bundles_load(bundle: Path) -> None:
+def test_intact_bundles_load(bundle: Path) -> None:
     policy = load_bundle(bundle)
     assert (policy.obs_size, policy.action_size, policy.min_age, policy.max_age, policy.dt) == (10, 2, 0, 4, 0.02)
     assert policy.metadata["env"] == "Reacher-v5"
-    forge(bundle)  # the forger's tools themselves break nothing
+    forge(bundle)  # forging alone breaks nothing
     (bundle / "README.md").write_text("a model card may lie beside it")
     assert load_bundle(bundle, "onnx").metadata["checksum"] == policy.metadata["checksum"]
 
@@ -144,7 +144,7 @@ BAD_POLICIES: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("name", "value"), BAD_POLICIES, ids=range(len(BAD_POLICIES)))
 def test_policies_that_are_not_the_weights(bundle: Path, name: str, value: Any) -> None:
-    """A well-made bundle whose description does not fit: told apart before anything large is allocated."""
+    """A valid bundle whose description does not fit is refused before anything large is allocated."""
     forge(bundle, lambda document: document["policy"].update({name: value}))
     refused(bundle, "")
 
@@ -158,7 +158,7 @@ def test_a_transformer_needs_a_network_for_age_0(bundle: Path) -> None:
 
 @pytest.mark.parametrize(("max_age", "action_size"), [(10_001, 1), (10_000, 1001)])
 def test_a_small_file_cannot_ask_for_much_memory(max_age: int, action_size: int) -> None:
-    """An observation's policy has the same weights at any max_age."""
+    """A policy that reads only the observation has the same weights at any max_age."""
 
     def document(max_age: int) -> dict[str, Any]:
         low, high = ([value] * action_size for value in (-1.0, 1.0))
@@ -221,21 +221,21 @@ def with_header(entries: dict[str, Any], rest: bytes) -> bytes:
 
 
 def test_broken_weights(bundle: Path) -> None:
-    whole = (bundle / WEIGHTS).read_bytes()
-    entries, rest = header(whole)
+    data = (bundle / WEIGHTS).read_bytes()
+    entries, rest = header(data)
     name = "head.0.w"
 
     def changed(**values: Any) -> bytes:
         return with_header(entries | {name: entries[name] | values}, rest)
 
     huge = [2**31, 2**31]
-    for data, words in [
+    for broken, words in [
         (b"", "not a safetensors"),
-        (whole[:7], "not a safetensors"),
-        (whole[:100], "not a safetensors"),
-        (whole[:-1], "not a safetensors"),
-        (whole + b"\0", "not a safetensors"),
-        (struct.pack("<Q", 2**63) + whole[8:], "header is too long"),
+        (data[:7], "not a safetensors"),
+        (data[:100], "not a safetensors"),
+        (data[:-1], "not a safetensors"),
+        (data + b"\0", "not a safetensors"),
+        (struct.pack("<Q", 2**63) + data[8:], "header is too long"),
         (struct.pack("<Q", (1 << 20) + 1) + b" " * (1 << 21), "header is too long"),
         (with_header({}, b""), "lack array"),
         (changed(shape=huge), "not a safetensors"),
@@ -246,7 +246,7 @@ def test_broken_weights(bundle: Path) -> None:
         (changed(dtype="PICKLE"), "not a safetensors"),
         (changed(shape=[1, *entries[name]["shape"]]), "expected float32"),
     ]:
-        forge(bundle, weights=data)
+        forge(bundle, weights=broken)
         refused(bundle, words)
 
 
@@ -274,7 +274,7 @@ def test_weights_of_other_kinds(bundle: Path) -> None:
 
 
 def test_sums_of_other_files(bundle: Path, tmp_path: Path) -> None:
-    """Weights of another bundle, cut ones, missing ones: without a forged sum they do not come as far as the parser."""
+    """Foreign, cut and missing weights: without a forged checksum they do not reach the parser."""
     other = bundle_of(tmp_path / "other", policy_of("vdpo", seed=1))
     shutil.copy(other / WEIGHTS, bundle / WEIGHTS)
     refused(bundle, "cut or changed")
@@ -299,25 +299,25 @@ def test_links_and_pipes(bundle: Path, tmp_path: Path, name: str) -> None:
 
 
 def test_foreign_graphs(bundle: Path, tmp_path: Path) -> None:
-    """Whatever it computes: if it is not the policy in the weights, it does not act."""
+    """A graph that does not compute the policy in the weights is refused."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    whole = (bundle / GRAPH).read_bytes()
+    graph = (bundle / GRAPH).read_bytes()
     other = bundle_of(tmp_path / "other", policy_of("vdpo", seed=1))
-    renamed = onnx.load_from_string(whole)
+    renamed = onnx.load_from_string(graph)
     renamed.graph.input[2].name = "delay"
     for node in renamed.graph.node:
         for i, name in enumerate(node.input):
             if name == "age":
                 node.input[i] = "delay"
     (tmp_path / "secret.bin").write_bytes(b"\0" * 1_000_000)
-    external = onnx.load_from_string(whole)
+    external = onnx.load_from_string(graph)
     tensor = next(t for t in external.graph.initializer if len(t.dims) == 2 and t.data_type == TensorProto.FLOAT)
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value=str(tmp_path / "secret.bin"))
-    custom = onnx.load_from_string(whole)
+    custom = onnx.load_from_string(graph)
     custom.graph.node[0].domain = "evil.domain"
     custom.opset_import.append(helper.make_opsetid("evil.domain", 1))
     nothing = helper.make_graph(
@@ -331,7 +331,7 @@ def test_foreign_graphs(bundle: Path, tmp_path: Path) -> None:
     for data, words in [
         (b"", "cannot load"),
         (b"garbage", "cannot load"),
-        (whole[: len(whole) // 2], "cannot load"),
+        (graph[: len(graph) // 2], "cannot load"),
         ((other / GRAPH).read_bytes(), "other actions than the weights"),
         (constant.SerializeToString(), "other actions than the weights"),
         (renamed.SerializeToString(), "inputs and outputs"),
@@ -359,7 +359,7 @@ def test_without_a_graph(bundle: Path) -> None:
 @settings(max_examples=150, deadline=None, database=None)
 @given(data=st.data())
 def test_any_change_is_noticed(original: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    """A byte changed, a stretch cut out or put in, in any file: one line, or (spaces in the JSON) the same policy."""
+    """Bytes changed, removed or inserted in any file give one line, or (spaces in the JSON) the same policy."""
     home = tmp_path_factory.mktemp("changed")
     name = data.draw(st.sampled_from([DOCUMENT, WEIGHTS]))
     content = bytearray((original / name).read_bytes())
@@ -381,7 +381,7 @@ def test_any_change_is_noticed(original: Path, tmp_path_factory: pytest.TempPath
 @settings(max_examples=150, deadline=None, database=None)
 @given(content=st.binary(max_size=200), length=st.integers(0, 2**64 - 1) | st.integers(0, 300))
 def test_any_weights_are_refused(original: Path, tmp_path_factory: Any, content: bytes, length: int) -> None:
-    """A fuzzer behind right sums: the parser itself meets garbage."""
+    """A fuzzer with valid checksums, so that the parser itself meets garbage."""
     home = tmp_path_factory.mktemp("fuzzed")
     shutil.copytree(original, home, dirs_exist_ok=True)
     forge(home, weights=struct.pack("<Q", length) + content)

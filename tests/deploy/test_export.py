@@ -1,4 +1,4 @@
-"""`delayrl export` and `delayrl latency`: what stands in a bundle, and where it may be written."""
+"""`delayrl export` and `delayrl latency`: the content of a bundle, and where it may be written."""
 
 import json
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_a_run_becomes_a_bundle(run: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_the_bundle_plays_as_the_run(run: Path, tmp_path: Path) -> None:
-    """A whole episode in the task, from age 0 on, with what the wrapper shows."""
+    """A complete episode in the task, from age 0 on, with what the wrapper shows."""
     export_run(run, tmp_path / "bundle")
     policy, bundles = load(run), [load_bundle(tmp_path / "bundle", backend) for backend in ("numpy", "onnx")]
     env = make("Reacher-v5", 3)
@@ -65,10 +65,10 @@ def test_the_bundle_plays_as_the_run(run: Path, tmp_path: Path) -> None:
     while not done:
         expected = policy.act(obs, info)
         for bundle in bundles:
-            found = bundle(obs, info["actions"], info["age"])
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+            action = bundle(obs, info["actions"], info["age"])
+            np.testing.assert_allclose(action, expected, rtol=0, atol=1e-5)
         ages.append(info["age"])
-        obs, _, terminated, truncated, info = env.step(found)
+        obs, _, terminated, truncated, info = env.step(action)
         done = terminated or truncated
     assert ages == [0, 1, 2, *[3] * 47]
 
@@ -78,15 +78,15 @@ def test_the_graph_says_what_it_is(run: Path, tmp_path: Path) -> None:
 
     export_run(run, tmp_path / "bundle")
     session = onnxruntime.InferenceSession(tmp_path / "bundle" / "policy.onnx")
-    told = json.loads(session.get_modelmeta().custom_metadata_map["delayrl"])
+    properties = json.loads(session.get_modelmeta().custom_metadata_map["delayrl"])
     metadata = load_bundle(tmp_path / "bundle").metadata
-    assert told == {k: v for k, v in metadata.items() if k not in ("files", "checksum", "format")}
+    assert properties == {k: v for k, v in metadata.items() if k not in ("files", "checksum", "format")}
 
 
 def test_the_same_run_gives_the_same_bundle(run: Path, tmp_path: Path) -> None:
-    for name in ("one", "two"):
+    for name in ("first", "second"):
         export_run(run, tmp_path / name)
-    assert load_bundle(tmp_path / "one").metadata["checksum"] == load_bundle(tmp_path / "two").metadata["checksum"]
+    assert load_bundle(tmp_path / "first").metadata["checksum"] == load_bundle(tmp_path / "second").metadata["checksum"]
 
 
 def test_before_the_first_evaluation(tmp_path: Path) -> None:
@@ -135,14 +135,14 @@ def test_odd_rows_are_one_line(rows: bytes, tmp_path: Path, capsys: pytest.Captu
 
 
 def test_training_may_go_on_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another checkpoint comes right after the newest was looked up: step and weights are of the same one."""
+    """If a checkpoint appears while the newest is read, step and weights still belong to the same one."""
     run = run_of(tmp_path / "run", "bpql")
     latest = Run.latest
 
     def then_another(self: Run) -> Checkpoint:
-        found = latest(self)
-        run.save(found.step + 120, found.arrays("agent"), None, {}, complete=True)
-        return found
+        newest = latest(self)
+        run.save(newest.step + 120, newest.arrays("agent"), None, {}, complete=True)
+        return newest
 
     monkeypatch.setattr(Run, "latest", then_another)
     assert export_run(run.path, tmp_path / "bundle")["step"] == 240
@@ -229,14 +229,14 @@ def test_a_module_beside_the_bundle_is_not_run(name: str, tmp_path: Path, monkey
 def test_latency_refuses(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bundle"
     export_run(run, out)
-    for words, told in (
+    for options, message in (
         (["--period", "0"], "milliseconds above 0"),
         (["--period", "nan"], "milliseconds above 0"),
         (["--decisions", "0"], "decisions must lie"),
         (["--ages", "9", "--backend", "numpy"], "ages 0..3; got 9"),
         (["--backend", "torch"], "invalid choice"),
     ):
-        assert told in refused(capsys, "latency", str(out), *words)
+        assert message in refused(capsys, "latency", str(out), *options)
     (out / "policy.onnx").unlink()
     with pytest.raises(DelayRLError, match=r"policy.onnx is missing"):
         latency(out, "onnx", decisions=1)

@@ -23,11 +23,11 @@ from delayrl.deploy.hub import card, pull, push
 from delayrl.errors import DelayRLError
 
 COMMIT = "0123456789" * 4
-SITE = "https://huggingface.co/"  # the client looks at the addresses that it is told; it asks the local server only
+SITE = "https://huggingface.co/"  # the client checks the form of this address but does not use it
 
 
 class Hub(http.server.ThreadingHTTPServer):
-    """What it keeps, and what it was asked for."""
+    """Repositories in `root`, and the files that were requested."""
 
     root: Path
     asked: list[str]
@@ -36,7 +36,7 @@ class Hub(http.server.ThreadingHTTPServer):
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
-    """As much of the hub's interface as pushing and pulling need."""
+    """The part of the hub's interface that push and pull need."""
 
     server: Hub
 
@@ -63,7 +63,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
             (hub.root / repo).mkdir(parents=True, exist_ok=True)
             self.reply(200, {"url": SITE + repo})
             return
-        if self.path == "/api/validate-yaml":  # the hub reads the head of a model card before it takes it
+        if self.path == "/api/validate-yaml":  # the hub checks the head of a model card before it accepts it
             self.reply(200, {"errors": [], "warnings": []})
             return
         home = hub.root / "/".join(parts[2:4])
@@ -146,7 +146,7 @@ def test_card(hub: Hub, bundle: Path) -> None:
 
 
 def test_cards_are_text() -> None:
-    """Names from somebody else's metadata stay in their cells."""
+    """Names from foreign metadata stay in their cells."""
     evil = "x\n---\n<script>alert(1)</script> | [link](http://evil) \x1b[31m" + "y" * 1000
     metadata = {"agent": evil, "env": evil, "delay": evil, "checksum": "0"}
     metadata["policy"] = {"obs_size": 1, "action_size": 1, "max_age": 0}
@@ -166,7 +166,7 @@ def test_a_bundle_that_is_broken_is_not_pushed(hub: Hub, bundle: Path) -> None:
 
 
 def test_what_is_broken_does_not_arrive(hub: Hub, bundle: Path, tmp_path: Path) -> None:
-    """Nothing is left in the target, nor beside it, and no local path stands in the message."""
+    """Nothing is left in the target or beside it, and the message has no local path."""
     push(bundle, "some/pendulum")
     home, out = hub.root / "some/pendulum", tmp_path / "back"
     before = sorted(tmp_path.iterdir())
@@ -178,12 +178,12 @@ def test_what_is_broken_does_not_arrive(hub: Hub, bundle: Path, tmp_path: Path) 
         assert "/tmp" not in str(error.value)
         assert sorted(tmp_path.iterdir()) == before
 
-    whole = (home / WEIGHTS).read_bytes()
+    weights = (home / WEIGHTS).read_bytes()
     (home / WEIGHTS).write_bytes(pickle.dumps([1, 2]))
     refused("some/pendulum/policy.safetensors is cut or changed")
     (home / WEIGHTS).unlink()
     refused("is missing")
-    (home / WEIGHTS).write_bytes(whole)
+    (home / WEIGHTS).write_bytes(weights)
     hub.asked.clear()
     hub.sizes = {"bundle.json": LIMITS["bundle.json"] + 1}
     refused("larger than")

@@ -1,4 +1,4 @@
-"""The UDP demonstration: packets go through, the history is right, and both processes end."""
+"""The UDP demonstration: packets arrive, the history is right, and both processes end."""
 
 import json
 import subprocess
@@ -38,7 +38,7 @@ def test_the_history_holds_the_pole_and_without_it_falls() -> None:
 
 
 def test_by_the_clock() -> None:
-    """How well it stands depends on the machine; that it goes through and ends does not."""
+    """The returns depend on the machine; that packets arrive and both processes end does not."""
     episodes, statistics = run("delayed", Link(1, 3), 40, real_time=True)
     assert len(episodes) == 2
     assert all(0 < episode["length"] <= 40 for episode in episodes)
@@ -48,13 +48,13 @@ def test_by_the_clock() -> None:
 
 
 def test_a_late_start() -> None:
-    """The first observation is late too: the plant was idle for four steps, and the history says so."""
-    late = Link(4, 5, first=4)
-    episodes, statistics = run("delayed", late, 150)
+    """The first observation is late too: the plant was idle for four steps, which the history contains."""
+    link = Link(4, 5, first=4)
+    episodes, statistics = run("delayed", link, 150)
     assert [episode["return"] for episode in episodes] == [150, 150]
     assert (statistics["missed"], statistics["decisions"]) == (8, 292)
     assert statistics["age_max"] <= 5
-    _, statistics = run("delayed", late, 40, real_time=True)
+    _, statistics = run("delayed", link, 40, real_time=True)
     assert statistics["missed"] >= 6  # the fourth command is only late; more are missed on a busy machine
     assert statistics["invalid"] == statistics["future"] == 0
 

@@ -1,4 +1,4 @@
-"""Known delays are found again: of environments to the step, of logs to the row."""
+"""Known delays are measured: of environments to the step, of logs to the row."""
 
 import csv
 import json
@@ -148,13 +148,13 @@ def delays(env: gym.Env | str, **words) -> tuple:
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "InvertedPendulum-v5", "delayrl/Walk-v0"])
-@pytest.mark.parametrize(("late", "slow"), [(0, 0), (5, 0), (0, 3), (4, 2)])
-def test_constant_delays(name: str, late: int, slow: int) -> None:
+@pytest.mark.parametrize(("observation", "action"), [(0, 0), (5, 0), (0, 3), (4, 2)])
+def test_constant_delays(name: str, observation: int, action: int) -> None:
     """0: the observation that step(a) returns reacts to a. Delays add up, in either order of the wrappers."""
-    want = ([slow], [late], [late + slow])
-    assert delays(Delayed(ActionDelay(make(name), slow), late)) == want
-    assert delays(ActionDelay(Delayed(make(name), late), slow)) == want
-    assert delays(DelayObservation(ActionDelay(make(name), slow), late))[2] == want[2]
+    want = ([action], [observation], [observation + action])
+    assert delays(Delayed(ActionDelay(make(name), action), observation)) == want
+    assert delays(ActionDelay(Delayed(make(name), observation), action)) == want
+    assert delays(DelayObservation(ActionDelay(make(name), action), observation))[2] == want[2]
 
 
 @pytest.mark.parametrize(
@@ -166,12 +166,12 @@ def test_channels_of_the_wrapper(text: str, want: tuple) -> None:
 
 @pytest.mark.parametrize("text", ["uniform:1:3", "uniform:1:4@raw", "gilbert:0:4:0.2:0.4@fifo", "paper-stochastic-5"])
 def test_laws_and_rules_of_the_wrapper(text: str) -> None:
-    """The ages that are found are those that the wrapper shows."""
+    """The measured ages are those that the wrapper shows."""
     env = Delayed(make("Pendulum-v1"), text)
-    found = probe(env, episodes=4)
-    assert set(found.action) == {0}
-    assert 1 < len(found.observation) <= env.history + 1
-    assert max(found.observation) == env.history
+    probed = probe(env, episodes=4)
+    assert set(probed.action) == {0}
+    assert 1 < len(probed.observation) <= env.history + 1
+    assert max(probed.observation) == env.history
 
 
 def test_bare_tasks_by_name() -> None:
@@ -292,12 +292,12 @@ STEPS: dict[str, Callable[[float, float, float], tuple[float, float]]] = {
 def signals(plant: str, delay, rows: int = 1500, noise: float = 0.0, policy: bool = True, wander: float = 0.8) -> tuple:
     """Commands and late observations; `delay` in rows, or a function of the row."""
     rng = np.random.default_rng(0)
-    states, u, y, x, v, memory = [0.0], np.zeros(rows), np.zeros(rows), 0.0, 0.0, 0.0
+    states, u, y, x, v, walk = [0.0], np.zeros(rows), np.zeros(rows), 0.0, 0.0, 0.0
     for t in range(rows):
-        late = delay(t) if callable(delay) else delay
-        y[t] = states[max(0, t - late)] + noise * rng.normal()
-        memory = wander * memory + 0.3 * rng.normal()
-        u[t] = np.tanh(memory - 0.5 * y[t]) if policy else memory
+        rows_late = delay(t) if callable(delay) else delay
+        y[t] = states[max(0, t - rows_late)] + noise * rng.normal()
+        walk = wander * walk + 0.3 * rng.normal()
+        u[t] = np.tanh(walk - 0.5 * y[t]) if policy else walk
         x, v = STEPS[plant](x, v, u[t])
         states.append(x)
     return u, y
@@ -340,7 +340,7 @@ def test_dead_time_of_plants(plant: str, policy: bool, tmp_path: Path) -> None:
 
 
 def test_the_peak_is_no_delay(tmp_path: Path) -> None:
-    """Why it is not the peak that is reported: the plant's own lag is in it, here more than twice the delay."""
+    """The peak is not reported, because it includes the plant's own lag: here more than twice the delay."""
     e = from_log(log(tmp_path / "log.csv", *signals("second", 4, policy=False, wander=0.99)))
     assert e.delay == pytest.approx(4 * ROW)
     assert e.peak.lag > 10 * ROW
@@ -404,7 +404,7 @@ def test_a_delay_that_drifts_and_a_cold_start(tmp_path: Path) -> None:
 
 
 def test_period_and_rounding(tmp_path: Path) -> None:
-    """Up: an action that is still on its way must be remembered. But not for what a float adds."""
+    """Rounded up, because an action on its way must be remembered; but not for rounding errors of floats."""
     path = log(tmp_path / "log.csv", *signals("servo", 7))
     assert [from_log(path, period).step for period in (0.02, 0.04, 0.07, 0.14, 1.0)] == [7, 4, 2, 1, 1]
     for steps in range(200):
@@ -433,14 +433,14 @@ def test_stamps_are_exact(tmp_path: Path) -> None:
 
 
 def test_simulated_robot(tmp_path: Path) -> None:
-    """HalfCheetah, observations four steps late, a random feedback policy: what was set comes out."""
+    """HalfCheetah, observations four steps late, a random feedback policy: the estimate is right."""
     env = Delayed(make("HalfCheetah-v5"), 4)
     rng = np.random.default_rng(0)
-    gains, memory, rows = 0.1 * rng.normal(size=(6, 17)), np.zeros(6), []
+    gains, walk, rows = 0.1 * rng.normal(size=(6, 17)), np.zeros(6), []
     obs, _ = env.reset(seed=0)
     for t in range(1000):
-        memory = 0.8 * memory + 0.3 * rng.normal(size=6)
-        action = np.tanh(gains @ obs + memory).astype(np.float32)
+        walk = 0.8 * walk + 0.3 * rng.normal(size=6)
+        action = np.tanh(gains @ obs + walk).astype(np.float32)
         rows.append([t * env.unwrapped.dt, *action, *obs])
         obs, *_ = env.step(action)
     names = ["time", *(f"action_{i}" for i in range(6)), *(f"observation_{i}" for i in range(17))]
@@ -587,7 +587,7 @@ def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_example_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """65 ms late, of a servo with a lag of its own, after a cold start; 50 ms and more, stamped."""
+    """A servo with a lag of its own, 65 ms late after a cold start; and stamped delays of 50 ms and more."""
     for name, options in (("arm.csv", []), ("stamps.csv", ["--stamps"])):
         script = [sys.executable, str(ROOT / "examples" / "make_log.py"), str(tmp_path / name), *options]
         subprocess.run(script, check=True)

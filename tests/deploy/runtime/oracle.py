@@ -1,6 +1,6 @@
-"""What a controller must show, worked out the slow way: all events are kept, every answer is computed from all of them.
+"""What a controller must show, by brute force: all events are kept, and every answer is computed from all of them.
 
-Events are (kind, x, y) with small whole numbers, so that a fuzzer and `hypothesis` can speak them. Times are multiples
+Events are (kind, x, y) with small whole numbers, which a fuzzer and `hypothesis` can make. Times are multiples
 of a quarter of a period of 1/16 s, so that floating point is exact and halfway cases happen all the time.
 """
 
@@ -19,13 +19,13 @@ Event = tuple[str, int, int]
 
 
 def nearest(x: float) -> int:
-    """The whole number that is nearest; halfway the larger."""
+    """The nearest whole number; halfway, the larger."""
     return min(range(int(x) - 1, int(x) + 2), key=lambda m: (abs(x - m), -m))
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Of a controller, in numbers."""
+    """The settings of a controller, as numbers."""
 
     seconds: bool
     max_age: int
@@ -40,7 +40,7 @@ class Setting:
 
 
 class Counting:
-    """A policy whose n-th action is n, and which remembers what it was shown."""
+    """A policy whose n-th action is n, and which records its inputs."""
 
     action_size, dt = 1, DT
     low, high = np.float32([-1e6]), np.float32([1e6])
@@ -58,11 +58,11 @@ class Counting:
 
 @dataclass
 class Oracle:
-    """Keeps the events of the present episode and the tallies of all."""
+    """Keeps the events of the present episode and the counts of all episodes."""
 
     setting: Setting
     episode: int = 0
-    start: float | None = 0.0  # None while the first observation or command is to say it
+    start: float | None = 0.0  # None until the first observation or command sets it
     # ("obs", stamp, content) | ("command", now, action) | ("fix", step, action), as far as they were accepted
     log: list[tuple[str, float, float]] = field(default_factory=list)
     tally: dict[str, int] = field(default_factory=dict)
@@ -85,7 +85,7 @@ class Oracle:
     def steps(self, until: float | None = None) -> tuple[list[float], list[float], int, int]:
         """Beginnings and actions of all steps, and how many were missed and replaced.
 
-        With `until`, there is one more beginning: that of the step that a command then is for.
+        With `until`, there is one more beginning: that of the step of a command at that time.
         """
         s, begins, actions, missed, replaced = self.setting, [], [], 0, 0
         commands = [e for e in self.log if e[0] != "obs"] + ([("command", until, None)] if until is not None else [])
@@ -101,15 +101,15 @@ class Oracle:
                     begins.append(begin - (quiet - i) * s.period)
                     actions.append(0.0 if s.idle is None else s.idle)
             else:
-                whole = nearest((begin - begins[-1]) / s.period)
-                if whole == 0:
+                gap = nearest((begin - begins[-1]) / s.period)
+                if gap == 0:
                     replaced += 1
                     if action is None:
                         return begins, actions[:-1], missed, replaced
                     actions[-1] = action
                     continue
-                missed += whole - 1
-                for _ in range(whole - 1):
+                missed += gap - 1
+                for _ in range(gap - 1):
                     begins.append(begins[-1] + s.period)
                     actions.append(actions[-1] if s.idle is None else s.idle)
             begins.append(begin)
@@ -187,7 +187,7 @@ class Oracle:
 
 
 def play(setting: Setting, events: list[Event]) -> dict[str, int]:
-    """Give the same events to a controller and to the oracle; they must agree on all answers. Returns what happened."""
+    """Give the same events to a controller and to the oracle, which must agree; return counts of what happened."""
     world = 0.0  # the clock
     policy = Counting(setting.obs_size, setting.max_age)
     controller = Controller(
@@ -231,7 +231,7 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
         elif kind == "observe":
             stamp, content, episode = world - x * unit, float(number), None
             match y // 2:
-                case 1 if sent:  # again, or at last: whatever was made before
+                case 1 if sent:  # again, or for the first time: one that was made before
                     stamp, content = sent[x % len(sent)]
                 case 2:
                     content = [math.nan, math.inf, -math.inf, 1e39, -1e300][x % 5]
@@ -329,7 +329,7 @@ def draw_setting(rng: np.random.Generator) -> Setting:
 
 
 def draw_events(rng: np.random.Generator, setting: Setting, length: int) -> list[Event]:
-    """A control loop on a bad network: mostly in order, with everything that goes wrong in between."""
+    """A control loop on a bad network: mostly regular, with everything that can go wrong in between."""
     ticks = 4 if setting.seconds else 1
     chaos = rng.choice([0.05, 0.3])
     calm = rng.random(length) > chaos

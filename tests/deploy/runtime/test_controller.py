@@ -1,4 +1,4 @@
-"""The history that the controller keeps is the plant's, whatever the network does."""
+"""The controller's history matches the plant, whatever the network does."""
 
 import dataclasses
 import math
@@ -76,7 +76,7 @@ def test_any_event_sequence_against_the_oracle(setting: Setting, events: list) -
 
 
 class Recorder:
-    """A policy that keeps what it is shown; its actions are random, and the same for the same call."""
+    """A policy that records its inputs; the sequence of its actions is random and repeatable."""
 
     def __init__(self, env: gym.Env, max_age: int, dt: float | None = None) -> None:
         self.obs_size, self.action_size = env.observation_space.shape[0], env.action_space.shape[0]
@@ -90,18 +90,18 @@ class Recorder:
 
 
 @pytest.mark.parametrize("stamps", ["steps", "seconds"])
-@pytest.mark.parametrize("late", [0, 3])
+@pytest.mark.parametrize("first", [0, 3])
 @pytest.mark.parametrize("delay", ["0", "1", "5", "uniform:0:4", "gilbert:1:5:0.2:0.4@fifo", "uniform:0:3+action=2"])
-def test_shows_what_the_wrapper_shows(stamps: str, delay: str, late: int) -> None:
-    """The wrapper's shown observation goes through the network: here, one that brings all of them at random.
+def test_shows_what_the_wrapper_shows(stamps: str, delay: str, first: int) -> None:
+    """A network that brings observations in random order shows the policy what the wrapper shows.
 
-    The first ones `late` steps late: nobody can act before, and the plant does what it does by itself.
+    The first observation arrives `first` steps late. Until then nobody can act, and the plant is idle.
     """
     env = Delayed(gym.make("Pendulum-v1"), delay)
     policy = Recorder(env, env.history, dt=0.05)
     lag = env.delay.action.maximum
     # the control period; actions in flight and steps without a command take so many nominal ones
-    uneven = 0.04 if lag or late else 0.2
+    uneven = 0.04 if lag or first else 0.2
     controller = Controller(policy, stamps=stamps, action_delay=lag, on_overrun="raise")
     rng = np.random.default_rng(0)
     clock = 100.0
@@ -114,7 +114,7 @@ def test_shows_what_the_wrapper_shows(stamps: str, delay: str, late: int) -> Non
             clock += 0.05 * rng.uniform(1 - uneven, 1 + uneven)
             times.append(clock)
             mailbox[step] = info["truth"]
-            if step < late:
+            if step < first:
                 obs, _, _, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
                 continue
             now = clock if stamps == "seconds" else step
@@ -158,7 +158,7 @@ def test_missed_periods_are_in_the_history() -> None:
 
 
 def test_a_slow_first_call_costs_no_action() -> None:
-    """The policy compiles at its first call: that is over when the controller stands, and in no statistic."""
+    """The policy compiles at its first call, which is over when the controller is made and is in no statistic."""
     clock = [0.0]
 
     class Slow(Counting):
@@ -191,7 +191,7 @@ def test_the_cold_start_is_not_in_the_effective_delay() -> None:
 @pytest.mark.parametrize(("stamps", "dt"), [("steps", 1.0), ("seconds", 0.25)])
 @pytest.mark.parametrize("announced", [True, False])
 def test_a_first_observation_that_comes_late_is_as_old_as_it_is(stamps: str, dt: float, announced: bool) -> None:
-    """By the wrapper's count, s_0 has the age 5 at step 5; the plant was idle meanwhile. Both modes say the same."""
+    """By the wrapper's count, s_0 has the age 5 at step 5, and the plant was idle before. Both modes agree."""
     policy = counting(8)
     controller = Controller(policy, stamps=stamps, idle=[7.0], **({} if stamps == "steps" else {"dt": dt}))
     if announced:
@@ -316,7 +316,7 @@ def test_what_the_plant_really_did() -> None:
 
 
 def test_actions_in_flight_add_to_the_age() -> None:
-    """With κ = 2 the plant does the n-th action in step n + 2, and before that what it does by itself."""
+    """With κ = 2 the plant does the n-th action in step n + 2; before that it is idle."""
     policy = counting(4)
     controller = Controller(policy, action_delay=2)
     plant = [0.0, 0.0]  # what it does in step 0, 1, ...
@@ -394,14 +394,14 @@ def test_bad_settings_are_refused(arguments: dict, message: str) -> None:
         Controller(counting(), **arguments)
 
 
-def test_a_policy_may_scribble_on_what_it_is_shown() -> None:
-    class Scribbler(Counting):
+def test_a_policy_may_overwrite_its_inputs() -> None:
+    class Overwriter(Counting):
         def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
             action = super().__call__(obs, actions, age)
             obs[:], actions[:] = -1, -1
             return action
 
-    policy = Scribbler(1, 3)
+    policy = Overwriter(1, 3)
     controller = Controller(policy)
     controller.observe([5.0], 0)
     for _ in range(3):
@@ -410,8 +410,8 @@ def test_a_policy_may_scribble_on_what_it_is_shown() -> None:
 
 
 @pytest.mark.parametrize("on_overrun", ["hold", "clip"])
-def test_an_observation_older_than_the_memory(on_overrun: str) -> None:
-    """Long forgotten: still an overrun, `clip` has nothing to show and holds, and the age is no nonsense."""
+def test_an_observation_older_than_the_history(on_overrun: str) -> None:
+    """Still an overrun: `clip` has nothing to show and holds, and the age is a sensible estimate."""
     controller = Controller(counting(2), stamps="seconds", dt=0.25, on_overrun=on_overrun)
     controller.observe([1.0], 90.0, 90.0)  # 40 periods before the first command
     for i in range(300):
@@ -421,7 +421,7 @@ def test_an_observation_older_than_the_memory(on_overrun: str) -> None:
     controller.observe([1.0], 101.0, 180.0)
     assert controller.act(100 + 0.25 * 300) == action
     assert controller.statistics.age_max == 296
-    controller.act(1e9)  # a stall of many steps costs no memory
+    controller.act(1e9)  # a stall of many steps does not grow the history
     controller.observe([2.0], 1e9, 1e9)
     controller.act(1e9 + 0.25)
     assert controller.policy.calls[-1][0::2] == (2.0, 1)
@@ -455,7 +455,7 @@ def test_time_must_go_forward() -> None:
 
 
 def test_two_threads() -> None:
-    """A network thread pours in observations, doubled and shuffled, while another acts: what is shown fits together."""
+    """Threads bring observations, duplicated and shuffled, while another acts: inputs of the policy stay consistent."""
     seen: list[tuple[float, list[float], int]] = []
     given: list[float] = []  # step -> action
 
@@ -493,7 +493,7 @@ def test_two_threads() -> None:
             before = len(seen)
             given.append(float(controller.act()[0]))
             asked.append(seen[-1] if len(seen) > before else None)
-            if asked[-1] is None:  # everything here is too old: let the network have the processor
+            if asked[-1] is None:  # all observations are too old: yield to the network
                 time.sleep(0.001)
     finally:
         finished.set()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from oracle import Counting
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "ros2_node.py"
 
 
 class Node:
@@ -90,14 +90,14 @@ def test_late_messages_meet_the_right_history(example: Any) -> None:
     for step in range(30):
         Node.now += 20_000_000 + int(rng.integers(-2_000_000, 2_000_000))
         made.append(Node.now - 1_000_000)  # measured just before the tick, but only delivered three ticks later
-        late = max(0, step - 3)
-        node.subscribed["joint_states"](joint_state([float(late)], [0.5], made[late]))
-        node.subscribed["joint_states"](joint_state([float(late)], [0.5], made[late]))  # twice
+        newest = max(0, step - 3)
+        node.subscribed["joint_states"](joint_state([float(newest)], [0.5], made[newest]))
+        node.subscribed["joint_states"](joint_state([float(newest)], [0.5], made[newest]))  # twice
         tick()
-        assert policy.calls[-1][0] == late
-        assert policy.calls[-1][2] == step - late
+        assert policy.calls[-1][0] == newest
+        assert policy.calls[-1][2] == step - newest
         given = [data[0] for _, data in node.published]
-        assert policy.calls[-1][1] == given[late:step] + [0.0] * (4 - step + late)
+        assert policy.calls[-1][1] == given[newest:step] + [0.0] * (4 - step + newest)
     assert len(node.published) == 30
     assert {topic for topic, _ in node.published} == {"commands"}
     node.timers[1][1]()
