@@ -1,7 +1,8 @@
 """Pictures of a summary, as PNG files."""
 
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,64 +44,58 @@ def styles(labels: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     return chosen
 
 
-def draw(summary: Summary, out: Path) -> dict[tuple[Setting, str], list[str]]:
-    """Draw everything that there are numbers for.
-
-    Returns:
-        File names by setting and kind: curves, delay, aggregates.
-    """
+def draw(summary: Summary, out: Path) -> Mapping[tuple[Setting, str], list[str]]:
+    """Draw everything that there are numbers for; returns file names by setting and kind: curves, delay, aggregates."""
     import matplotlib
 
     matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
     looks = {label: (summary.name(label), *style) for label, style in styles(summary.labels).items()}
-    made: dict[tuple[Setting, str], list[str]] = {}
+    files: dict[tuple[Setting, str], list[str]] = defaultdict(list)
     for number, setting in enumerate(summary.settings):
-        results = [r for r in summary.results.values() if r.place.setting == setting and r.runs]
-        learners = [r for r in results if not r.is_anchor]
-        delays = sorted({r.place.delay for r in learners}, key=delay_order)
-        names = []
-        for index, delay in enumerate(delays):
+        learners = [r for r in summary.results.values() if r.place.setting == setting and r.runs and not r.is_anchor]
+        for index, delay in enumerate(sorted({r.place.delay for r in learners}, key=delay_order)):
             name = f"curves-{number}-{index}.png"
             _curves([r for r in learners if r.place.delay == delay], delay, looks, out / name)
-            names.append(name)
-        made[setting, "curves"] = names
+            files[setting, "curves"].append(name)
         constant = [r for r in learners if isinstance(r.place.delay, int)]
-        made[setting, "delay"] = []
         if len({r.place.delay for r in constant}) > 1:
+            files[setting, "delay"].append(f"delay-{number}.png")
             _against_delay(constant, looks, out / f"delay-{number}.png")
-            made[setting, "delay"] = [f"delay-{number}.png"]
         aggregates = [a for a in summary.aggregates if a.setting == setting]
-        made[setting, "aggregates"] = []
         if aggregates:
+            files[setting, "aggregates"].append(f"aggregates-{number}.png")
             _aggregates(aggregates, looks, out / f"aggregates-{number}.png")
-            made[setting, "aggregates"] = [f"aggregates-{number}.png"]
-    return made
+    return files
 
 
-def _grid(count: int, width: float = 4.0, height: float = 2.9) -> tuple[Any, list[Any]]:
+def _panels(lines: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
     from matplotlib import pyplot
 
-    columns = min(3, count)
-    lines = math.ceil(count / columns)
-    figure, axes = pyplot.subplots(
-        lines, columns, figsize=(max(6.0, width * columns), height * lines + 0.5), layout="constrained", squeeze=False
-    )
-    panels = list(axes.flat)
-    for panel in panels:
+    figure, panels = pyplot.subplots(lines, columns, figsize=size, layout="constrained", squeeze=False)
+    for panel in panels.flat:
         panel.grid(alpha=0.2)
         panel.spines[["top", "right"]].set_visible(False)
-    for panel in panels[count:]:
-        panel.set_visible(False)
     return figure, panels
 
 
-def _save(figure: Any, panels: list[Any], path: Path) -> None:
+def _task_panels(results: list[Result]) -> tuple[Any, dict[str, Any]]:
+    """A panel for each task, in up to three columns."""
+    tasks = sorted({r.place.env for r in results})
+    columns = min(3, len(tasks))
+    lines = math.ceil(len(tasks) / columns)
+    figure, panels = _panels(lines, columns, (max(6.0, 4.0 * columns), 2.9 * lines + 0.5))
+    for panel in panels.flat[len(tasks) :]:
+        panel.set_visible(False)
+    return figure, dict(zip(tasks, panels.flat, strict=False))
+
+
+def _save(figure: Any, path: Path) -> None:
     from matplotlib import pyplot
 
     lines = {
         label: line
-        for panel in panels
+        for panel in figure.axes
         for line, label in zip(*panel.get_legend_handles_labels(), strict=True)
         if not label.startswith("_")
     }
@@ -130,59 +125,44 @@ def _anchor_lines(axes: Any, result: Result) -> None:
 
 def _curves(results: list[Result], delay: int | str, looks: dict[str, Look], path: Path) -> None:
     """Mean over the seeds and standard deviation, a panel for each task."""
-    tasks = sorted({r.place.env for r in results})
-    figure, panels = _grid(len(tasks))
-    for task, axes in zip(tasks, panels, strict=False):
+    figure, panels = _task_panels(results)
+    for task, axes in panels.items():
         mine = [r for r in results if r.place.env == task]
         for result in mine:
-            curve = result.curves
-            axes.plot(curve.steps, curve.mean, **_line(looks[result.place.label]))
+            steps, mean, style = result.curves.steps, result.curves.mean, _line(looks[result.place.label])
+            axes.plot(steps, mean, **style)
             if result.runs > 1:
-                std = curve.returns.std(0, ddof=1)
-                colour = looks[result.place.label][1]
-                axes.fill_between(curve.steps, curve.mean - std, curve.mean + std, color=colour, alpha=0.13, lw=0)
+                std = result.curves.returns.std(0, ddof=1)
+                axes.fill_between(steps, mean - std, mean + std, color=style["color"], alpha=0.13, lw=0)
         _anchor_lines(axes, mine[0])
         axes.set_title(f"{_plain(task)}, Δ = {_plain(str(delay))}", fontsize=10)
         axes.set(xlabel="environment steps", ylabel="return")
         axes.ticklabel_format(axis="both", style="sci", scilimits=(-3, 4))
-    _save(figure, panels, path)
+    _save(figure, path)
 
 
 def _against_delay(results: list[Result], looks: dict[str, Look], path: Path) -> None:
     """Return after training against the delay, a panel for each task; bars are standard deviations over the seeds."""
-    tasks = sorted({r.place.env for r in results})
-    figure, panels = _grid(len(tasks))
-    for task, axes in zip(tasks, panels, strict=False):
+    figure, panels = _task_panels(results)
+    for task, axes in panels.items():
         mine = [r for r in results if r.place.env == task and not r.partial]
         for label in dict.fromkeys(r.place.label for r in mine):
             points = [r for r in mine if r.place.label == label]
-            values = np.array([mean_std(r.curves.final) for r in points])
-            delays = [r.place.delay for r in points]
-            axes.errorbar(
-                delays,
-                values[:, 0],
-                np.nan_to_num(values[:, 1]),
-                marker="o",
-                markersize=4,
-                capsize=2,
-                **_line(looks[label]),
-            )
+            mean, std = np.array([mean_std(r.curves.final) for r in points]).T
+            delays, style = [r.place.delay for r in points], _line(looks[label])
+            axes.errorbar(delays, mean, np.nan_to_num(std), marker="o", markersize=4, capsize=2, **style)
         if mine:
             _anchor_lines(axes, mine[0])
         axes.set_title(_plain(task), fontsize=10)
         axes.set(xlabel="delay (steps)", ylabel="return")
-    _save(figure, panels, path)
+    _save(figure, path)
 
 
 def _aggregates(aggregates: list[Aggregate], looks: dict[str, Look], path: Path) -> None:
     """IQM with its interval, and the performance profile beside it, a line for each delay."""
-    from matplotlib import pyplot
-
     delays = list(dict.fromkeys(a.delay for a in aggregates))
-    figure, axes = pyplot.subplots(
-        len(delays), 2, figsize=(9, 2.8 * len(delays) + 0.5), layout="constrained", squeeze=False
-    )
-    for (left, right), delay in zip(axes, delays, strict=True):
+    figure, panels = _panels(len(delays), 2, (9, 2.8 * len(delays) + 0.5))
+    for (left, right), delay in zip(panels, delays, strict=True):
         mine = [a for a in aggregates if a.delay == delay]
         title = "all constant delays" if delay is None else f"Δ = {_plain(str(delay))}"
         for height, a in enumerate(reversed(mine)):
@@ -195,7 +175,5 @@ def _aggregates(aggregates: list[Aggregate], looks: dict[str, Look], path: Path)
         left.set(title=f"IQM, {title}", xlabel="normalised return", ylim=(-0.6, len(mine) - 0.4))
         right.set(title=f"Performance profile, {title}", xlabel="normalised return τ", ylabel="runs above τ")
         for panel in (left, right):
-            panel.grid(alpha=0.2)
-            panel.spines[["top", "right"]].set_visible(False)
             panel.title.set_fontsize(10)
-    _save(figure, list(axes.flat), path)
+    _save(figure, path)

@@ -1,6 +1,5 @@
 """Results: one for each condition, from the cells and rows of all its seeds, with the anchors of its task."""
 
-import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,24 +36,15 @@ class Curves(NamedTuple):
         return self.returns[:, -1] if self.steps.size else np.zeros(0)
 
 
-NO_CURVES = Curves(*statistics.common_steps([]))
-
-
 class Anchor(NamedTuple):
-    """A return that others are measured by.
+    """A return that others are measured by: its value (NaN if there is none), its number of runs and their agent.
 
-    Attributes:
-        value: NaN if there is none.
-        runs: how many the value is from.
-        source: the agent that it is the return of.
-        curves: of those runs.
-        inside: whether it is of a reference inside another agent, because there is no delay-free SAC.
+    `inside`: the runs are of a reference inside another agent, because there is no delay-free SAC.
     """
 
     value: float = NAN
     runs: int = 0
     source: str = ""
-    curves: Curves = NO_CURVES
     inside: bool = False
 
 
@@ -97,10 +87,10 @@ class Result:
     condition: Condition
     progress: Progress
     seeds: int
-    partial: bool = True
-    privileged: bool = False
-    curves: Curves = NO_CURVES
-    reference: Curves = NO_CURVES
+    partial: bool
+    privileged: bool
+    curves: Curves
+    reference: Curves
     random_anchor: Anchor = NO_ANCHOR
     reference_anchor: Anchor = NO_ANCHOR
 
@@ -131,16 +121,14 @@ class Result:
     @property
     def steps_to_threshold(self) -> float:
         """The step at which the mean over the seeds first reaches Ret_df; NaN if it does not, or without Ret_df."""
-        if not self.runs:
-            return NAN
-        curve = self.curves
-        return float(statistics.steps_to_threshold(curve.steps, curve.mean, self.reference_anchor.value))
+        threshold = self.reference_anchor.value
+        return (
+            float(statistics.steps_to_threshold(self.curves.steps, self.curves.mean, threshold)) if self.runs else NAN
+        )
 
     @property
     def seeds_at_threshold(self) -> int:
         """How many seeds reach Ret_df, each for itself."""
-        if not self.runs or math.isnan(self.reference_anchor.value):
-            return 0
         return int((self.curves.returns >= self.reference_anchor.value).any(-1).sum())
 
 
@@ -159,19 +147,19 @@ def delay_order(delay: int | str) -> tuple[bool, int, str]:
 def make_results(
     standing: Standing, groups_of: Mapping[str, Sequence[RowGroup]], labels: Mapping[str, str]
 ) -> dict[Place, Result]:
-    """Make one result of the cells that differ in nothing but their seeds, with its anchors.
+    """Make a result with its anchors of all cells that differ in nothing but their seeds.
 
     Args:
         standing: the cells and how far they are.
-        groups_of: rows by the cell's id.
-        labels: by the cell's id.
+        groups_of: rows of each cell, by its id.
+        labels: label of each cell, by its id.
     """
     members: dict[Place, list[tuple[Cell, Progress]]] = defaultdict(list)
     for cell, progress in sorted(standing, key=lambda item: item[0].id):
         condition = cell.condition
         setting = Setting(condition.protocol, condition.preset)
         place = Place(setting, condition.env, condition.label, labels[cell.id])
-        if any(set(other.seeds) & set(cell.seeds) for other, _ in members[place]):  # not a part of it: another one
+        if any(set(other.seeds) & set(cell.seeds) for other, _ in members[place]):  # the same seeds again
             place = place._replace(label=f"{place.label} #{cell.id[:8]}")
         members[place].append((cell, progress))
     results = [
@@ -193,15 +181,12 @@ def _result(place: Place, standing: Standing, groups: Sequence[RowGroup]) -> Res
     complete = {seed for seed, run in runs.items() if max(run) >= steps}
     kept = complete or set(runs)
     reference = {seed: run for group in groups for seed, run in group.runs("reference").items() if seed in kept}
-    state = _state({progress.state for _, progress in standing}, bool(runs))
-    step = min(
-        [progress.step for _, progress in standing if progress.state == state]
-        or [progress.step for _, progress in standing]
-    )
+    progress = [progress for _, progress in standing]
+    state = _state({p.state for p in progress}, bool(runs))
     return Result(
         place,
         replace(standing[0][0].condition, steps=steps),
-        Progress(state, step),
+        Progress(state, min([p.step for p in progress if p.state == state] or [p.step for p in progress])),
         len({seed for cell, _ in standing for seed in cell.seeds} | set(runs)),
         not complete,
         any(group.privileged for group in groups),
@@ -231,17 +216,15 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
     random_anchor = reference_anchor = NO_ANCHOR
     if random:  # it does not learn, so that all its evaluations are alike
         best = min(random, key=_fewest_overrides)
-        random_anchor = Anchor(float(best.curves.returns.mean()), best.runs, "random", best.curves)
+        random_anchor = Anchor(float(best.curves.returns.mean()), best.runs, "random")
     if plain:
         best = min(plain, key=_fewest_overrides)
-        name = f"{best.place.label}, no delay"
-        reference_anchor = Anchor(float(best.curves.final.mean()), best.runs, name, best.curves)
+        reference_anchor = Anchor(float(best.curves.final.mean()), best.runs, f"{best.place.label}, no delay")
     elif inside:
         first = ("vdpo", "lifting")
         best = min(inside, key=lambda o: ([o.condition.agent != name for name in first], _fewest_overrides(o)))
-        name = f"the reference inside {best.place.label}, Δ={best.place.delay}"
-        curves = best.reference
-        reference_anchor = Anchor(float(curves.final.mean()), curves.returns.shape[0], name, curves, True)
+        source, final = f"the reference inside {best.place.label}, Δ={best.place.delay}", best.reference.final
+        reference_anchor = Anchor(float(final.mean()), final.size, source, True)
     return replace(result, random_anchor=random_anchor, reference_anchor=reference_anchor)
 
 

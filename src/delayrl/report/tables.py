@@ -124,10 +124,9 @@ def _key(result: Result) -> tuple[str, str]:
 
 def _published(kind: Kind, env: str, delay: int | str, agent: str, representation: str) -> PublishedValue | None:
     measure = "steps" if kind == "steps" else "normalised"
-    key = (measure, env.removeprefix("delayrl/"), str(delay), agent)
-    if kind == "ablation" or representation != "transformer":
-        return published_values().get((*key, representation))  # Table 3; its last column is VDPO itself, as in Table 2
-    return published_values().get((*key, ""))
+    if kind != "ablation" and representation == "transformer":
+        representation = ""  # only values of the ablation name one
+    return published_values().get((measure, env.removeprefix("delayrl/"), str(delay), agent, representation))
 
 
 def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) -> TableEntry:
