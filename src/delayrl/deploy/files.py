@@ -35,14 +35,7 @@ HEADER_LIMIT = 1 << 20
 
 
 def read_files(path: str | Path, wanted: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Read a bundle and verify the checksums.
-
-    Args:
-        path: the folder of the bundle.
-        wanted: names of files to read besides bundle.json; those that it does not list are left out.
-
-    Returns:
-        The content of bundle.json, and the bytes of all files that were read.
+    """Read bundle.json and those `wanted` files that it lists; return its content, and the bytes of all files by name.
 
     Raises:
         DelayRLError: anything missing, cut, changed, or not a regular file.

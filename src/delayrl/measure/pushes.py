@@ -51,15 +51,9 @@ class Pushes:
 def push(
     env: Env, seed: int, scale: float, steps: int, count: int | None = None, base: Rollout | None = None
 ) -> Pushes:
-    """Play an episode, and again with each action changed in turn.
+    """Play an episode of at most `steps` steps, and again with each of its first `count` actions changed (None: all).
 
-    Args:
-        env: the environment.
-        seed: of the episode and its actions.
-        scale: size of the push, relative to the range of the actions.
-        steps: longest length of the episode.
-        count: how many actions are changed, from the first on; None for all.
-        base: the episode without a push, if it has been played.
+    `scale` is the size of a push relative to the range of the actions; `base` is the episode, if it has been played.
     """
     low, high = _bounds(env)
     chosen = actions(env, seed, steps, scale)

@@ -44,18 +44,9 @@ def read_signals(
     episode: str | None = None,
     unit: str = "s",
 ) -> Log:
-    """Read the time stamps, commands and observations of a log.
+    """Read the time stamps, commands and observations of a log; for the arguments see `from_log`.
 
-    Args:
-        path: a CSV file with a header (commas, semicolons or tabs), or Parquet.
-        time: column of the time stamps; by default `time`, `timestamp` or `t`.
-        commands: columns, or beginnings of their names; by default `command`, `cmd`, `action`.
-        observations: the same; by default `observation`, `obs`.
-        episode: column that changes where a new recording begins; by default `episode` or `episode_index`, if any.
-        unit: of the time stamps: s, ms, us or ns.
-
-    Raises:
-        DelayRLError: the file cannot be used.
+    CSV files need a header, and separate columns with commas, semicolons or tabs.
     """
     table = _Table(path)
     stamps = table.find(time, TIMES, "time stamps", "--time")

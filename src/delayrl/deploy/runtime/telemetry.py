@@ -14,50 +14,30 @@ Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
 class Statistics:
     """Totals over all episodes since the controller was made.
 
-    `age_*`, `delay_*` and `period_*` leave out the cold start: they count the decisions of an episode from the first
-    observation on that was made after the first command. Before that, the age only shows how long the episode has run.
-    Decisions that `on_overrun="raise"` refuses appear in `overruns` only. The means and deviations are NaN while
-    nothing has been counted (`age_max` is 0), and `delay_*` and `period_*` are NaN with stamps in steps.
-
-    Attributes:
-        decisions: actions chosen by `act`.
-        counted: decisions after the cold start.
-        age_mean: mean age in steps, with actions in flight: the effective delay.
-        age_std: its standard deviation, the jitter.
-        age_max: the largest age.
-        delay_mean: mean seconds from an observation's stamp to the decision.
-        delay_std: its standard deviation.
-        period_mean: mean seconds between two commands.
-        period_std: its standard deviation.
-        overruns: decisions with an age above the policy's longest, including refused ones and the cold start.
-        missed: steps without a command of their own.
-        replaced: commands that another one replaced less than half a period later.
-        overridden: commands that somebody else gave.
-        new: observations that were used: each the newest when it arrived.
-        late: observations older than the newest, or of another episode.
-        duplicate: observations with the stamp of the newest.
-        invalid: observations that are not finite in single precision, or have a stamp beyond ±1e15 or a step below 0.
-        future: observations stamped more than half a period after they arrived.
+    `age_*`, `delay_*` and `period_*` leave out the cold start of an episode: they begin with the first decision whose
+    observation was made after the first command. Before, the age only shows how long the episode has run. Decisions
+    that `on_overrun="raise"` refuses appear in `overruns` only. The means and deviations are NaN while nothing has been
+    counted (`age_max` is 0), and `delay_*` and `period_*` are NaN with stamps in steps.
     """
 
-    decisions: int
-    counted: int
-    age_mean: float
-    age_std: float
+    decisions: int  # actions chosen by `act`
+    counted: int  # decisions after the cold start
+    age_mean: float  # steps, with actions in flight: the effective delay
+    age_std: float  # steps: the jitter
     age_max: int
-    delay_mean: float
+    delay_mean: float  # seconds from an observation's stamp to the decision
     delay_std: float
-    period_mean: float
+    period_mean: float  # seconds between two commands
     period_std: float
-    overruns: int
-    missed: int
-    replaced: int
-    overridden: int
-    new: int
-    late: int
-    duplicate: int
-    invalid: int
-    future: int
+    overruns: int  # decisions with an age above the policy's longest, with refused ones and the cold start
+    missed: int  # steps without a command of their own
+    replaced: int  # commands that another one replaced less than half a period later
+    overridden: int  # commands that somebody else gave
+    new: int  # observations that were used, each the newest when it arrived
+    late: int  # observations older than the newest, or of another episode
+    duplicate: int  # observations with the stamp of the newest
+    invalid: int  # observations not finite in single precision, or with a stamp beyond ±1e15 or a step below 0
+    future: int  # observations stamped more than half a period after they arrived
 
 
 class Moments:
