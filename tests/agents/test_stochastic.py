@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import delayrl
 from conftest import TINY, learned, record
-from delayrl.cli.main import main as cli
+from delayrl.cli import main as cli
 from delayrl.core import replay as ring
 from delayrl.core.protocol import OFFICIAL
 from delayrl.core.types import Spec
