@@ -161,7 +161,7 @@ def test_channels_of_a_text() -> None:
         ("2+reward=3@raw", "newest or fifo"),
         ("recorded:nowhere.csv", "No such file"),
         ("recorded:a+b@c.csv", "a\\+b@c.csv"),
-        ("recorded", "unknown delay"),
+        ("recorded", "is not a number"),
         ("recorded:" + "9" * 5000 + ",", "No such file|too long"),
         ("1e400", "is not a number|finite|whole"),
         ("gamma:1e-200:1:5", "between"),

@@ -12,10 +12,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Print a table of the tasks."""
     from delayrl.envs import tasks
+    from delayrl.wrappers.single import seconds_of
 
     rows = []
-    for task in tasks():
-        limit, seconds = task.time_limit or "-", f"{task.seconds:g}" if task.seconds else "-"
-        rows.append([task.name, task.obs_size, task.action_size, f"±{task.action_high:g}", limit, seconds])
+    for name, env in tasks():
+        actions, seconds = env.action_space, seconds_of(env)
+        sizes = [env.observation_space.shape[0], actions.shape[0], f"±{actions.high.max():g}"]
+        rows.append([name, *sizes, env.spec.max_episode_steps or "-", f"{seconds:g}" if seconds else "-"])
     print_table(["task", "observation", "action", "range", "time limit", "seconds a step"], rows)
     print("\nAny other Gymnasium task with flat Box observations and bounded Box actions works as well.")

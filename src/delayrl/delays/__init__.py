@@ -1,37 +1,19 @@
 """Laws of travel times, channels with arrival rules, and the text form of both. Needs NumPy alone."""
 
-from delayrl.delays.channels import PAPER_STOCHASTIC_5, Channel, Delay, as_delay
-from delayrl.delays.laws import (
-    Choice,
-    Constant,
-    DelayLaw,
-    Markov,
-    Recorded,
-    gamma,
-    gilbert_elliott,
-    poisson,
-    random_walk,
-    uniform,
-)
-from delayrl.delays.recordings import recorded
-from delayrl.delays.text import Rule, short_label
-
-__all__ = [
-    "PAPER_STOCHASTIC_5",
-    "Channel",
-    "Choice",
-    "Constant",
-    "Delay",
-    "DelayLaw",
-    "Markov",
-    "Recorded",
-    "Rule",
-    "as_delay",
-    "gamma",
-    "gilbert_elliott",
-    "poisson",
-    "random_walk",
-    "recorded",
-    "short_label",
-    "uniform",
-]
+from delayrl.delays.channels import PAPER_STOCHASTIC_5 as PAPER_STOCHASTIC_5
+from delayrl.delays.channels import Channel as Channel
+from delayrl.delays.channels import Delay as Delay
+from delayrl.delays.channels import DelayLike as DelayLike
+from delayrl.delays.channels import as_delay as as_delay
+from delayrl.delays.channels import short_label as short_label
+from delayrl.delays.laws import Choice as Choice
+from delayrl.delays.laws import Constant as Constant
+from delayrl.delays.laws import DelayLaw as DelayLaw
+from delayrl.delays.laws import Markov as Markov
+from delayrl.delays.laws import Recorded as Recorded
+from delayrl.delays.laws import gamma as gamma
+from delayrl.delays.laws import gilbert_elliott as gilbert_elliott
+from delayrl.delays.laws import poisson as poisson
+from delayrl.delays.laws import random_walk as random_walk
+from delayrl.delays.laws import uniform as uniform
+from delayrl.delays.recordings import recorded as recorded

@@ -1,12 +1,40 @@
-"""Channels and delays: which message counts on each of the three ways, and the delays of all three together."""
+"""Channels and delays, and their text form. `as_delay` reads it, and `str` of a law, a channel or a delay writes it.
 
+```
+5                       every observation is 5 steps late
+80ms, 0.08s             a time, rounded up to whole steps; the task must say how long a step is
+uniform:1:5             1 to 5 steps, equally likely
+choice:1=0.1,5=0.9      1 step with probability 0.1, 5 with 0.9
+poisson:3:8             Poisson of mean 3, cut at 8
+gamma:3:1.5:8           gamma of mean 3 and standard deviation 1.5, rounded up to whole steps, cut at 8
+gilbert:1:6:0.05:0.3    a network in a good (1 step) or bad state (6); worsens with 0.05, recovers with 0.3
+markov:0,5:0.9,0.1/0.5,0.5  a chain of two states with delays 0 and 5, and its transitions row by row
+walk:8, walk:8:0.5      a random walk on 0..8 that moves with probability 2/3 (or 0.5)
+recorded:trace.csv      measured delays, from a random one on; recorded:trace.csv:ms if they are times
+uniform:1:5@fifo        a rule: newest (the default), fifo or raw
+2+action=1+reward=3     observations 2 steps late, actions 1, rewards and terminations 3
+paper-stochastic-5      VDPO's stochastic delay: 5 with probability 0.9, else uniform on 1..5; rule raw
+```
+"""
+
+import hashlib
+import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import get_args
+from functools import cached_property
+from typing import Any, Literal, get_args
 
-from delayrl.delays.laws import Constant, DelayLaw
-from delayrl.delays.text import CHANNELS, PRESETS, Parser, Rule, StepSeconds, short_label
+from delayrl.delays import laws
+from delayrl.delays.laws import Constant, DelayLaw, whole_steps
+from delayrl.delays.recordings import in_steps, is_number, recorded, rounded_up
 from delayrl.errors import DelayRLError
 
+Rule = Literal["newest", "fifo", "raw"]
+"""Which message counts at step t. `newest`: of those that have arrived, the last one sent; older ones that arrive later
+are ignored. `fifo`: the same, but no message overtakes another. `raw`: s_{t-d} with d drawn anew at each step, so that
+the observation may go back in time."""
+StepSeconds = float | Callable[[], float | None] | None
+"""The length of an environment step, or a function that returns it; None if it is unknown."""
 NO_DELAY = Constant(0)
 
 
@@ -37,13 +65,21 @@ class Channel:
 
     def __str__(self) -> str:
         for name, preset in PRESETS.items():
-            if (self.law, self.rule) == preset:
+            if self == preset:
                 return name
         return str(self.law) if self.rule == "newest" else f"{self.law}@{self.rule}"
 
 
-PAPER_STOCHASTIC_5 = Channel(*PRESETS["paper-stochastic-5"])
-"""VDPO's stochastic delay of observations."""
+PAPER_STOCHASTIC_5 = Channel(laws.Choice((1, 2, 3, 4, 5), (0.02, 0.02, 0.02, 0.02, 0.92)), "raw")
+"""VDPO's stochastic delay of observations, §5.3: "Δ = 5 with probability 0.9 and Δ in [1, 5] with probability 0.1", so
+5 with 0.92. The paper does not say how it is drawn. Here each step draws anew, and the age is known."""
+PRESETS = {"paper-stochastic-5": PAPER_STOCHASTIC_5}
+CHANNELS = ("observation", "action", "reward")
+FORMS = (
+    "a delay is 5, 80ms, uniform:1:5, choice:1=0.1,5=0.9, poisson:MEAN:MAX, gamma:MEAN:DEVIATION:MAX, "
+    "gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, markov:0,5:0.9,0.1/0.5,0.5, recorded:FILE, paper-stochastic-5; "
+    "then @newest, @fifo or @raw"
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +94,7 @@ class Delay:
         for name in CHANNELS:
             channel = getattr(self, name)
             if isinstance(channel, str):
-                channel = _channel(*Parser(channel).channel(channel))
+                channel = Parser(channel).channel(channel)
             elif not isinstance(channel, Channel):
                 channel = Channel(channel)
             if not channel.maximum:
@@ -112,8 +148,12 @@ class Delay:
         return "+".join(parts)
 
 
-def as_delay(delay: float | str | DelayLaw | Channel | Delay, step_seconds: StepSeconds = None) -> Delay:
-    """Convert steps, a text, a law or a channel of the observations to a `Delay`.
+DelayLike = float | str | DelayLaw | Channel | Delay
+"""Steps, a text, a law or a channel of the observations, or a delay."""
+
+
+def as_delay(delay: DelayLike, step_seconds: StepSeconds = None) -> Delay:
+    """Convert what can stand for a delay to a `Delay`.
 
     Args:
         delay: the value to convert; a `Delay` is returned as it is.
@@ -128,11 +168,120 @@ def as_delay(delay: float | str | DelayLaw | Channel | Delay, step_seconds: Step
     if isinstance(delay, Channel):
         return Delay(delay)
     if isinstance(delay, str):
-        return Delay(**{name: _channel(*parsed) for name, parsed in Parser(delay, step_seconds).channels().items()})
+        return Delay(**Parser(delay, step_seconds).channels())
     if isinstance(delay, float) and delay.is_integer():
         delay = int(delay)
     return Delay(Channel(delay))  # type: ignore[arg-type]
 
 
-def _channel(law: DelayLaw, rule: str) -> Channel:
-    return Channel(law, rule)  # type: ignore[arg-type]  # Channel checks the rule
+def short_label(text: int | str) -> int | str:
+    """Replace long lists of numbers in a delay's text by their checksum, for rows and names of folders."""
+    if isinstance(text, int):
+        return text
+    return re.sub(r"[\d,./=e-]{40,}", lambda match: hashlib.sha256(match[0].encode()).hexdigest()[:12], text)
+
+
+class Parser:
+    """Parse the text of one delay. The methods raise DelayRLError if they cannot.
+
+    Args:
+        text: the text.
+        step_seconds: the length of a step. A function is called at most once, and only if the text holds a time.
+    """
+
+    def __init__(self, text: str, step_seconds: StepSeconds = None):
+        self._text, self._given_seconds = text, step_seconds
+
+    @cached_property
+    def step_seconds(self) -> float | None:
+        """The length of a step."""
+        return self._given_seconds() if callable(self._given_seconds) else self._given_seconds
+
+    def channels(self) -> dict[str, Channel]:
+        """Return each channel that the text names."""
+        channels: dict[str, Channel] = {}
+        for part in re.split(rf"\+(?=\s*(?:{'|'.join(CHANNELS)})\s*=)", self._text):
+            name, separator, rest = part.partition("=")
+            name = name.strip()
+            if not separator or name not in CHANNELS:
+                name, rest = "observation", part
+            if name in channels:
+                raise DelayRLError(f"the delay {self._text!r} gives two for the {name}s")
+            channels[name] = self.channel(rest.strip())
+        return channels
+
+    def channel(self, part: str) -> Channel:
+        """Return the channel that a part of the text describes."""
+        head, separator, rule = part.rpartition("@")
+        in_path = part.startswith("recorded:") and rule not in get_args(Rule)
+        if not separator or in_path:
+            return PRESETS.get(part) or Channel(self.law(part))
+        law = PRESETS[head].law if head in PRESETS else self.law(head)
+        return Channel(law, rule)  # type: ignore[arg-type]  # Channel checks the rule
+
+    def law(self, part: str) -> DelayLaw:
+        """Return the law that a part of the text describes."""
+        name, _, rest = part.partition(":")
+        if not rest:
+            return Constant(self.steps(part))
+        match name:
+            case "uniform":
+                return laws.uniform(*self.values(rest, self.steps, self.steps))
+            case "choice":
+                pairs = [pair.partition("=") for pair in rest.split(",")]
+                steps, probabilities = [self.steps(s) for s, _, _ in pairs], [self.probability(p) for _, _, p in pairs]
+                return laws.Choice(tuple(steps), tuple(probabilities))
+            case "poisson":
+                return laws.poisson(*self.values(rest, self.real, self.steps))
+            case "gamma":
+                return laws.gamma(*self.values(rest, self.real, self.real, self.steps))
+            case "gilbert":
+                readers = self.steps, self.steps, self.probability, self.probability
+                return laws.gilbert_elliott(*self.values(rest, *readers))
+            case "walk" if ":" in rest:
+                return laws.random_walk(*self.values(rest, self.steps, self.probability))
+            case "walk":
+                return laws.random_walk(self.steps(rest))
+            case "markov":
+                states, table = self.values(rest, str, str)
+                rows = tuple(tuple(map(self.probability, row.split(","))) for row in table.split("/"))
+                return laws.Markov(tuple(map(self.steps, states.split(","))), rows)
+            case "recorded" if re.fullmatch(r"(\d{1,9},)+(\d{1,9})?", rest):
+                return laws.Recorded(tuple(int(word) for word in rest.split(",") if word))
+            case "recorded":
+                path, _, unit = rest.rpartition(":")
+                return recorded(path, self.step_seconds, unit) if path and unit in ("s", "ms") else recorded(rest)
+        raise DelayRLError(f"unknown delay {part!r} ({FORMS})")
+
+    def values(self, rest: str, *readers: Callable[[str], Any]) -> list[Any]:
+        """Split what follows the name of a law at its colons, and read each value with its reader."""
+        words = rest.split(":")
+        if len(words) != len(readers):
+            raise DelayRLError(f"the delay {self._text!r} needs {len(readers)} values where {rest!r} is ({FORMS})")
+        return [reader(word) for reader, word in zip(readers, words, strict=True)]
+
+    def real(self, word: str) -> float:
+        """Read a number of steps or a time, without rounding."""
+        number, unit = self._split(word)
+        return in_steps(number, unit, self.step_seconds) if unit else number
+
+    def steps(self, word: str) -> int:
+        """Read whole steps, or a time that is rounded up to whole steps."""
+        number, unit = self._split(word)
+        if unit:
+            return rounded_up(in_steps(number, unit, self.step_seconds))
+        return whole_steps(int(number) if number.is_integer() else number)
+
+    def probability(self, word: str) -> float:
+        """Read a number that has no unit."""
+        number, unit = self._split(word)
+        if unit:
+            raise DelayRLError(f"a probability has no unit; got {word!r} in the delay {self._text!r}")
+        return number
+
+    def _split(self, word: str) -> tuple[float, str]:
+        """Split a word into its number and its unit."""
+        match = re.fullmatch(r"([+-]?[\d.]+(?:e[+-]?\d+)?)(s|ms)?", word.strip())
+        if not match or not is_number(match[1]):
+            raise DelayRLError(f"{word!r} in the delay {self._text!r} is not a number ({FORMS})")
+        return float(match[1]), match[2] or ""

@@ -13,8 +13,21 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from delayrl.delays.units import whole_steps
 from delayrl.errors import DelayRLError
+
+LONGEST, MOST_STATES = 100_000, 1000
+"""Of a delay, in steps, and of a chain. More is a mistake, and its buffers or tables would fill the memory."""
+
+
+def whole_steps(steps: Any) -> int:
+    """Check a delay. Raises DelayRLError for anything but a whole number of 0 to `LONGEST` steps."""
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
+        raise DelayRLError(f"a delay counts whole environment steps; got {steps!r}")
+    if steps < 0:
+        raise DelayRLError(f"a delay cannot be negative; got {steps:g}")
+    if steps > LONGEST:
+        raise DelayRLError(f"a delay is at most {LONGEST} steps; got {float(steps):g}")
+    return int(steps)
 
 
 @runtime_checkable
@@ -24,7 +37,6 @@ class DelayLaw(Protocol):
     @property
     def maximum(self) -> int:
         """The longest delay."""
-        ...
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw the travel time of the next message.
@@ -36,11 +48,9 @@ class DelayLaw(Protocol):
         Returns:
             The travel time in steps, and the state for the next message.
         """
-        ...
 
     def shifted(self, steps: int) -> "DelayLaw":
         """Return the law whose travel times are longer by `steps`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,37 +80,47 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Draw each delay independently from a finite distribution.
-
-    Attributes:
-        steps: the possible delays.
-        probabilities: the probability of each delay; they sum to 1.
-        name: the text of a law that a function below made.
-    """
+class _Listed:
+    """A law with a list of possible delays, and with the text of the function below that made it, if one did."""
 
     steps: tuple[int, ...]
-    probabilities: tuple[float, ...]
-    name: str = field(default="", compare=False)
+    name: str = field(default="", compare=False, kw_only=True)
 
     def __post_init__(self) -> None:
+        if not self.steps:
+            raise DelayRLError("a law of delays needs at least one delay; it has none")
         object.__setattr__(self, "steps", tuple(whole_steps(steps) for steps in self.steps))
-        object.__setattr__(self, "probabilities", _distribution(self.probabilities))
-        if len(self.steps) != len(self.probabilities):
-            raise DelayRLError(f"{len(self.steps)} delays need as many probabilities; got {len(self.probabilities)}")
 
     @property
     def maximum(self) -> int:
         """The longest possible delay, even if its probability is 0."""
         return max(self.steps)
 
-    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
-        """Draw one of the delays; the state stays 0."""
-        return self.steps[bisect_right(self._cumulative, random.random())], state
-
     def shifted(self, steps: int) -> Self:
         """Return the law whose delays are longer by `steps`."""
         return replace(self, steps=tuple(s + steps for s in self.steps), name="")
+
+
+@dataclass(frozen=True)
+class Choice(_Listed):
+    """Draw each delay independently from a finite distribution.
+
+    Attributes:
+        steps: the possible delays.
+        probabilities: the probability of each delay; they sum to 1.
+    """
+
+    probabilities: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "probabilities", _distribution(self.probabilities))
+        if len(self.steps) != len(self.probabilities):
+            raise DelayRLError(f"{len(self.steps)} delays need as many probabilities; got {len(self.probabilities)}")
+
+    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
+        """Draw one of the delays; the state stays 0."""
+        return self.steps[bisect_right(self._cumulative, random.random())], state
 
     @cached_property
     def _cumulative(self) -> list[float]:
@@ -112,31 +132,23 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Markov:
+class Markov(_Listed):
     """A Markov chain with a delay for each of its states. It moves once per message.
 
     Attributes:
         steps: the delay of each state.
         transitions: row i holds the probabilities of the states that follow state i.
-        name: the text of a law that a function below made.
     """
 
-    steps: tuple[int, ...]
     transitions: tuple[tuple[float, ...], ...]
-    name: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "steps", tuple(whole_steps(steps) for steps in self.steps))
+        super().__post_init__()
         size = len(self.steps)
         _check_states(size)
         object.__setattr__(self, "transitions", tuple(_distribution(row) for row in self.transitions))
         if len(self.transitions) != size or any(len(row) != size for row in self.transitions):
             raise DelayRLError(f"{size} states need a square table: {size} rows of {size} probabilities")
-
-    @property
-    def maximum(self) -> int:
-        """The longest delay of a state."""
-        return max(self.steps)
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw the next state of the chain; the first comes from the stationary distribution.
@@ -145,10 +157,6 @@ class Markov:
         """
         chain_state = bisect_right(self._cumulative[state], random.random())
         return self.steps[chain_state], chain_state + 1
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, steps=tuple(s + steps for s in self.steps), name="")
 
     @cached_property
     def stationary(self) -> tuple[float, ...]:
@@ -172,29 +180,13 @@ class Markov:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class Recorded(_Listed):
     """Replay measured delays in order. Each episode starts at a random one; after the last comes the first."""
-
-    steps: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        if not self.steps:
-            raise DelayRLError("a recorded delay needs at least one value; it is empty")
-        object.__setattr__(self, "steps", tuple(whole_steps(steps) for steps in self.steps))
-
-    @property
-    def maximum(self) -> int:
-        """The longest recorded delay."""
-        return max(self.steps)
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Return the next recorded delay; the state is 1 plus its index."""
         index = state % len(self.steps) if state else int(random.integers(len(self.steps)))
         return self.steps[index], index + 1
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, steps=tuple(s + steps for s in self.steps))
 
     def __str__(self) -> str:
         return f"recorded:{','.join(map(str, self.steps))},"
@@ -222,9 +214,7 @@ def gamma(mean: float, deviation: float, maximum: int) -> Choice:
     mean = _positive(mean, "the mean of a gamma delay")
     deviation = _positive(deviation, "the standard deviation of a gamma delay")
     if not 1e-3 <= deviation / mean <= 1e3:
-        raise DelayRLError(
-            f"a gamma delay's deviation must be between 1/1000 and 1000 means; got {deviation:g}, {mean:g}"
-        )
+        raise DelayRLError(f"a gamma delay's deviation is between 1/1000 and 1000 means; got {deviation:g}, {mean:g}")
     shape, scale = (mean / deviation) ** 2, deviation**2 / mean
     edges = [_gamma_below(shape, k / scale) for k in range(whole_steps(maximum) + 1)]
     weights = np.clip(np.diff(edges, prepend=0.0), 0, None)  # the series may be off by rounding errors
@@ -250,9 +240,6 @@ def random_walk(maximum: int, move: float = 2 / 3) -> Markov:
         chain[state, min(state + 1, maximum)] += move / 2
     name = f"walk:{maximum}" if move == 2 / 3 else f"walk:{maximum}:{_as_text(move)}"
     return Markov(tuple(range(size)), tuple(map(tuple, chain.tolist())), name=name)
-
-
-MOST_STATES = 1000
 
 
 def _check_states(count: int) -> None:

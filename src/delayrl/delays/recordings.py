@@ -1,12 +1,12 @@
-"""Files of measured delays."""
+"""Times as numbers of environment steps, and files of measured delays."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 
-from delayrl.delays.laws import Recorded
-from delayrl.delays.units import in_steps, is_number, rounded_up
+from delayrl.delays.laws import Recorded, whole_steps
 from delayrl.errors import DelayRLError, first_line
 
 
@@ -60,3 +60,30 @@ def _cells(path: Path) -> list[tuple[str, str]]:
     cells = [(f"line {i}", line.split(",")[-1].strip().strip('"')) for i, line in lines if line.strip()]
     has_header = bool(cells) and not is_number(cells[0][1])
     return cells[1:] if has_header else cells
+
+
+def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
+    """Convert a number with a unit ("" for steps, "s" or "ms") to environment steps, without rounding.
+
+    Raises:
+        DelayRLError: a time, although the length of a step is unknown.
+    """
+    if not unit:
+        return number
+    if not step_seconds:
+        raise DelayRLError("the task does not say how long a step is (no `dt`): give steps, or pass step_seconds")
+    return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds
+
+
+def rounded_up(steps: float) -> int:
+    """Round a delay up to whole steps: a message that arrives between two steps is seen at the later one."""
+    if not math.isfinite(steps):
+        raise DelayRLError(f"a delay must be finite; got {steps:g} steps")
+    # a millionth of a step is rounding error
+    return whole_steps(math.ceil(steps - 1e-6) if steps > 0 else math.floor(steps))
+
+
+def is_number(text: str) -> bool:
+    """Tell whether a text is a number, nan or infinity. Callers refuse the last two with messages of their own."""
+    number = r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
+    return bool(re.fullmatch(number, text.strip(), re.IGNORECASE))

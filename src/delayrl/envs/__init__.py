@@ -4,7 +4,6 @@ import contextlib
 import difflib
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -12,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import RescaleAction
 
-from delayrl.delays import Channel, Delay, DelayLaw, as_delay
+from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError, first_line
 from delayrl.wrappers import Delayed, check_spaces
@@ -25,7 +24,7 @@ paper.register()
 
 def make(
     env: str,
-    delay: float | str | DelayLaw | Channel | Delay = 0,
+    delay: DelayLike = 0,
     *,
     rescale: bool = False,
     history: int | None = None,
@@ -63,7 +62,7 @@ def make(
     return Delayed(task, delay, history, fill, idle)
 
 
-def delay_of(env: str, delay: float | str | DelayLaw | Channel | Delay) -> Delay:
+def delay_of(env: str, delay: DelayLike) -> Delay:
     """Convert a delay to steps of a task. The task is made only if its step length is needed.
 
     Raises:
@@ -106,26 +105,11 @@ def quiet() -> Iterator[None]:
         mujoco.set_mju_user_warning(None)
 
 
-@dataclass(frozen=True)
-class Task:
-    """What `delayrl tasks` shows of a task: sizes, action range, time limit in steps and step length in seconds."""
-
-    name: str
-    obs_size: int
-    action_size: int
-    action_high: float
-    time_limit: int | None
-    seconds: float | None
-
-
-def tasks() -> Iterator[Task]:
-    """List the papers' nine tasks, small ones to try things on, and ours."""
+def tasks() -> Iterator[tuple[str, Any]]:
+    """Make the papers' nine tasks, small ones to try things on, and ours, each with its id. Closes them after use."""
     small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
     ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
     for name in [f"{task}-v5" for task in paper.TASKS] + small + ours:
         env = make(name)
-        spaces = (env.observation_space.shape, env.action_space.shape)
-        limit = env.spec.max_episode_steps if env.spec else None
-        high = float(np.max(env.action_space.high))  # type: ignore[attr-defined]
-        yield Task(name, spaces[0][0], spaces[1][0], high, limit, seconds_of(env))  # type: ignore[index]
+        yield name, env
         env.close()

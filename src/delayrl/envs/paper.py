@@ -18,17 +18,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from delayrl.errors import DelayRLError
 
-TASKS = (
-    "Ant",
-    "HalfCheetah",
-    "Hopper",
-    "Humanoid",
-    "HumanoidStandup",
-    "Pusher",
-    "Reacher",
-    "Swimmer",
-    "Walker2d",
-)
+TASKS = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Pusher", "Reacher", "Swimmer", "Walker2d")
 OLDEST, MARGINS_SUMMED, TOO_NEW = (3, 2, 7), (3, 5, 0), (4, 0, 0)  # MuJoCo versions
 
 # The parts of the model that a fingerprint reads. It leaves out positions and orientations, because the axes of a round
@@ -56,15 +46,14 @@ def register() -> None:
             continue
         pusher = task == "Pusher"
         origin = gymnasium.registry["Pusher-v5" if pusher else f"{task}-v4"]
+        wrappers: list[Any] = [MuJoCo2, RewardBeforeStep] if pusher else [MuJoCo2]
         gymnasium.register(
             id=task_id,
             entry_point=origin.entry_point,
             max_episode_steps=origin.max_episode_steps,
             reward_threshold=origin.reward_threshold,
             kwargs={"xml_file": "pusher.xml"} if pusher else {},
-            additional_wrappers=(
-                (MuJoCo2.wrapper_spec(), RewardBeforeStep.wrapper_spec()) if pusher else (MuJoCo2.wrapper_spec(),)
-            ),
+            additional_wrappers=tuple(wrapper.wrapper_spec() for wrapper in wrappers),
         )
 
 
@@ -124,7 +113,10 @@ def restore_physics(base: Any) -> None:
         return
     import mujoco
 
-    version, model = _supported_version(mujoco.__version__), base.model
+    installed, model = mujoco.__version__, base.model
+    version = tuple(int(part) for part in re.findall(r"\d+", installed)[:3])
+    if not OLDEST <= version < TOO_NEW:
+        raise DelayRLError(f"the paper tasks need another MuJoCo; {installed} is installed: pip install 'mujoco>=3.2.7,<4'")
     for flag in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # versions without these flags lack the algorithms too
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, flag, 0))
     if version >= MARGINS_SUMMED:
@@ -172,13 +164,3 @@ def fingerprint(env: gymnasium.Env[Any, Any]) -> str:
     state = np.round(np.concatenate([data.qpos, data.qvel]), 5) + 0.0  # + 0.0 turns -0.0 into 0.0
     digest.update(repr(state.tolist()).encode())
     return digest.hexdigest()[:16]
-
-
-def _supported_version(installed: str) -> tuple[int, ...]:
-    version = tuple(int(part) for part in re.findall(r"\d+", installed)[:3])
-    if not OLDEST <= version < TOO_NEW:
-        raise DelayRLError(
-            f"the paper tasks need MuJoCo 3.2.7 or later, before 4, and {installed} is installed: "
-            "pip install 'mujoco>=3.2.7,<4'"
-        )
-    return version

@@ -23,16 +23,14 @@ from delayrl.wrappers.single import Delayed, Info
 from delayrl.wrappers.vector import DelayedVector
 
 
-def _augmented_space(observations: gym.Space[Any], actions: gym.Space[Any], history: int, delay: Delay) -> Box:
-    assert isinstance(observations, Box)
-    assert isinstance(actions, Box)
+def _augmented_space(observations: Any, actions: Any, history: int, delay: Delay) -> Box:
     if not history:
         return observations
     # a slot without an action holds zeros, which the action's own bounds need not contain
     low, high = np.minimum(actions.low, 0), np.maximum(actions.high, 0)
     numbers = 1 if delay.action.constant else 2
     # integer observations become float, because integers would truncate actions and age
-    dtype = np.promote_types(observations.dtype, np.float32)  # type: ignore[arg-type]
+    dtype = np.promote_types(observations.dtype, np.float32)
     return Box(
         np.concatenate([observations.low, np.tile(low, history), np.zeros(numbers)]).astype(dtype),
         np.concatenate([observations.high, np.tile(high, history), np.ones(numbers)]).astype(dtype),
@@ -56,11 +54,7 @@ def _augment(obs: NDArray[Any], info: Info, history: int, delay: Delay, dtype: A
 
 
 class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
-    """Show the augmented state as one vector.
-
-    Args:
-        env: an environment wrapped by `Delayed`.
-    """
+    """Show the augmented state of an environment wrapped by `Delayed` as one vector, [S + H·A + 1]."""
 
     def __init__(self, env: Delayed) -> None:
         if not isinstance(env, Delayed):
@@ -68,8 +62,7 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self.observation_space = _augmented_space(env.observation_space, env.action_space, env.history, env.delay)
-        dtype = self.observation_space.dtype
-        self._augment = partial(_augment, history=env.history, delay=env.delay, dtype=dtype)
+        self._augment = partial(_augment, history=env.history, delay=env.delay, dtype=self.observation_space.dtype)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start an episode."""
@@ -83,11 +76,7 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
 
 
 class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
-    """Show the augmented states of a vector of environments, [N, S + H·A + 1].
-
-    Args:
-        env: a vector of environments wrapped by `DelayedVector`.
-    """
+    """Show the augmented states of N environments wrapped by `DelayedVector`, [N, S + H·A + 1]."""
 
     def __init__(self, env: DelayedVector) -> None:
         if not isinstance(env, DelayedVector):

@@ -8,8 +8,8 @@ from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from delayrl.delays import Channel, Delay, DelayLaw, as_delay
-from delayrl.delays.units import whole_steps
+from delayrl.delays import Delay, DelayLike, as_delay
+from delayrl.delays.laws import whole_steps
 from delayrl.errors import DelayRLError
 from delayrl.wrappers.transit import Fill, Transit
 
@@ -18,18 +18,12 @@ Info = dict[str, Any]
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
     """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
-    if not isinstance(observations, Box):
-        raise DelayRLError(f"{name}: observations must be a Box; got {observations}. Flatten them first")
-    if len(observations.shape) != 1:
-        raise DelayRLError(
-            f"{name}: observations must be flat vectors; got shape {observations.shape} (images are not supported)"
-        )
-    if not isinstance(actions, Box) or len(actions.shape) != 1:
-        raise DelayRLError(f"{name}: actions must be a flat Box (continuous); got {actions}")
-    if not (np.issubdtype(actions.dtype, np.floating) and (actions.low < actions.high).all()):
-        raise DelayRLError(f"{name}: actions must be real numbers with low < high; got {actions}")
-    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
-        raise DelayRLError(f"{name}: actions must be bounded; got {actions}. Wrap it with RescaleAction or a clip")
+    if not isinstance(observations, Box) or len(observations.shape) != 1:
+        raise DelayRLError(f"{name}: observations must be a Box of flat vectors, not images; got {observations}")
+    if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
+        raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
+    if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
+        raise DelayRLError(f"{name}: actions must be bounded, with low < high; got {actions}")
 
 
 def name_of(env: Any) -> str:
@@ -47,27 +41,16 @@ def seconds_of(env: Any) -> float | None:
 
 
 def history_rows(env: Any, delay: Delay, history: int | None) -> int:
-    """Return the rows of the action history: `history`, or the longest age where it is None.
-
-    Raises:
-        DelayRLError: the delay is as long as an episode, or the history is shorter than the longest age.
-    """
+    """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
     limit = env.spec.max_episode_steps if env.spec is not None else None
     longest = max(delay.maximum, delay.reward.maximum)
     if limit is not None and longest >= limit:
-        raise DelayRLError(
-            f"a delay of {longest} steps is no shorter than an episode of {name_of(env)} ({limit} steps)"
-        )
+        raise DelayRLError(f"a delay of {longest} steps is no shorter than an episode of {name_of(env)} ({limit})")
     if history is None:
         return delay.maximum
     if whole_steps(history) < delay.maximum:
         raise DelayRLError(f"a history of {history} actions is too short for ages up to {delay.maximum}")
     return history
-
-
-def age_masks(history: int) -> NDArray[np.bool_]:
-    """Return the mask of each age as a row: row i is true in its first i slots, [history + 1, history]."""
-    return np.arange(history) < np.arange(history + 1)[:, None]  # type: ignore[no-any-return]
 
 
 def make_transit(delay: Delay, history: int, fill: Fill, actions: Box, idle: Any = None) -> Transit:
@@ -112,7 +95,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
     def __init__(
         self,
         env: gym.Env[NDArray[Any], NDArray[Any]],
-        delay: float | str | DelayLaw | Channel | Delay,
+        delay: DelayLike,
         history: int | None = None,
         fill: Fill = "first",
         idle: NDArray[Any] | None = None,
@@ -121,9 +104,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         inner: Any = env
         while isinstance(inner, gym.Wrapper):
             if isinstance(inner, Delayed):
-                raise DelayRLError(
-                    "the environment is delayed already: give one delay, as in Delayed(task, '2+action=1')"
-                )
+                raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
             inner = inner.env
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
@@ -133,7 +114,8 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         self.history = history_rows(env, self.delay, history)
         self._transit = make_transit(self.delay, self.history, fill, env.action_space, idle)
         self._limit = env.spec.max_episode_steps if env.spec is not None else None
-        self._masks, self._dtype = age_masks(self.history), env.action_space.dtype
+        self._masks = np.tri(self.history + 1, self.history, -1, bool)  # by age: true in the first `age` slots
+        self._dtype = env.action_space.dtype
         self._truth: NDArray[Any] = np.zeros(0)
         self._info: Info = {}
 

@@ -3,13 +3,12 @@
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from delayrl.delays import Channel, Delay, DelayLaw, as_delay
+from delayrl.delays import DelayLike, as_delay
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Info, age_masks, check_spaces, history_rows, make_transit, name_of, seconds_of
+from delayrl.wrappers.single import Info, check_spaces, history_rows, make_transit, name_of, seconds_of
 from delayrl.wrappers.transit import Fill, Transit
 
 
@@ -33,7 +32,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        delay: float | str | DelayLaw | Channel | Delay,
+        delay: DelayLike,
         history: int | None = None,
         fill: Fill = "first",
         step_seconds: float | None = None,
@@ -41,8 +40,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         if not isinstance(env, VectorEnv):
             raise DelayRLError(f"DelayedVector takes a vector of environments; got {type(env).__name__}. See Delayed")
         check_spaces(name_of(env), env.single_observation_space, env.single_action_space)
-        actions = env.single_action_space
-        assert isinstance(actions, Box)
+        actions: Any = env.single_action_space
         super().__init__(env)
         if step_seconds is None and (envs := getattr(env.unwrapped, "envs", None)):
             step_seconds = seconds_of(envs[0])
@@ -56,7 +54,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         self._transits = [make_transit(self.delay, self.history, fill, actions) for _ in range(env.num_envs)]
         mode = env.metadata.get("autoreset_mode")
         self._mode = getattr(mode, "value", mode or "NextStep")
-        self._masks, self._dtype = age_masks(self.history), actions.dtype
+        self._masks, self._dtype = np.tri(self.history + 1, self.history, -1, bool), actions.dtype
         self._ended = np.zeros(env.num_envs, bool)
         self._every = np.ones(env.num_envs, bool)
         self._every.setflags(write=False)
@@ -72,7 +70,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
             self._transits[i].reset(truth[i], seeds[i] if seeds is not None else None)
         self._ended[mask] = False
         obs, own = self._show(self._transits, truth)
-        return obs, infos | own | self._presence(own)
+        return obs, infos | own | {f"_{name}": self._every for name in own}
 
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Info]:
         """Issue an action in every environment. Returns what has arrived by the next step."""
@@ -96,7 +94,8 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
                 transit.step(truth[i], 0.0, False, False)
         self._ended = done
         obs, own = self._show(self._transits, truth)
-        return obs, rewards, terminated, truncated, infos | own | self._presence(own)
+        presence = {f"_{name}": self._every for name in own}  # in every environment, as Gymnasium's vectors say it
+        return obs, rewards, terminated, truncated, infos | own | presence
 
     def _finish(self, i: int, infos: Info) -> None:
         """Delay the last observation of environment i, whose next episode has started in the same step."""
@@ -119,7 +118,3 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
             own["observation_age"] = age - self.delay.action.maximum
             own["applied"] = np.array(applied)
         return np.array(observations), own
-
-    def _presence(self, own: Info) -> Info:
-        """Mark every entry as present in every environment, as Gymnasium's vectors do."""
-        return {f"_{name}": self._every for name in own}
