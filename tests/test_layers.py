@@ -1,89 +1,137 @@
-"""Imports go one way, and what must be light is light."""
+"""Imports go one way and never in a circle, what must be light is light, and files stay readable."""
 
 import ast
+import graphlib
+import re
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 import delayrl
 
 SOURCE = Path(delayrl.__file__).parent
-ORDER = [
-    "errors",
-    "delays wrappers envs",
-    "measure",
-    "deploy.statistics deploy.history deploy.network",
-    "deploy.controller deploy.files deploy.numpy_policy",
-    "deploy.onnx_graph deploy.onnx_policy deploy.hub",
-    "types config",
-    "views networks replay provenance",
-    "objectives transformer",
-    "deploy.jax_policy",
-    "deploy.bundle",
-    "agents.base",
-    "agents",
-    "runs plots tracking",
-    "policy",
-    "evaluation deploy.export deploy.latency",
-    "deploy",
-    "acting learning estimate",
-    "memory",
-    "training video",
-    "experiments experiments.statistics experiments.folders",
-    "experiments.summary",
-    "experiments.figures",
-    "experiments.report",
-    "experiments.grid experiments.worker",
-    "experiments.status experiments.runner",
-    "experiments.results experiments.slurm experiments.cluster",
-    "cli experiments.cli",
-    "__main__",
-]
-LAYER = {name: i for i, names in enumerate(ORDER) for name in names.split()}
+ROOMS = "errors delays wrappers envs core agents run play training report bench measure deploy cli __init__ __main__"
+"""Folders and files at the top, lowest first: each imports only what stands before it."""
+ROOM = {name: place for place, name in enumerate(ROOMS.split())}
+LIGHT = ("wrappers", "delays", "deploy.runtime.controller", "bench.folders", "cli.main", "run.checkpoint")
 
 
-def imports(file: Path) -> set[str]:
+def modules() -> dict[str, Path]:
+    """Our modules by name, below `delayrl`."""
+    return {".".join(file.relative_to(SOURCE).with_suffix("").parts): file for file in SOURCE.rglob("*.py")}
+
+
+def imports(file: Path, known: set[str]) -> set[str]:
     """Modules of ours that a file imports, wherever it does so."""
-    found = set()
+    names = set()
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return {name.removeprefix("delayrl.") for name in found if name.startswith("delayrl.")}
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    parts = [name.split(".")[1:] for name in names if name.startswith("delayrl.")]
+    return {module for part in parts if (module := nearest(part, known))}
 
 
-def layer(module: str) -> int | None:
-    parts = module.split(".")
-    return next((LAYER[m] for m in (".".join(parts[:2]), parts[0]) if m in LAYER), None)
+def nearest(part: list[str], known: set[str]) -> str | None:
+    """The module that a dotted name is of, or is in."""
+    for end in range(len(part), 0, -1):
+        for name in (".".join(part[:end]), ".".join([*part[:end], "__init__"])):
+            if name in known:
+                return name
+    return None
+
+
+def graph() -> dict[str, set[str]]:
+    """What each module imports."""
+    files = modules()
+    return {name: imports(file, set(files)) - {name} for name, file in files.items()}
+
+
+def room(module: str) -> str:
+    return module.split(".")[0]
+
+
+def arrows(imported: dict[str, set[str]]) -> set[tuple[str, str]]:
+    """Which room imports from which."""
+    pairs = {(room(module), room(other)) for module, others in imported.items() for other in others}
+    return {(one, other) for one, other in pairs if one != other}
+
+
+def assert_one_way(imported: dict[str, set[str]]) -> None:
+    """Rooms import downwards only, and modules not in a circle, those of one room included."""
+    for one, other in sorted(arrows(imported)):
+        assert ROOM[other] < ROOM[one], f"{one} imports {other}"
+    list(graphlib.TopologicalSorter(imported).static_order())
 
 
 def test_imports_go_one_way() -> None:
-    for file in SOURCE.rglob("*.py"):
-        module = ".".join(file.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
-        if module == "__init__":
-            continue
-        own = layer(module)
-        assert own is not None, f"{module} has no place in ORDER"
-        for name in imports(file):
-            other = layer(name)
-            if other is not None:
-                assert other <= own, f"{module} imports {name}"
+    assert {room(module) for module in modules()} == set(ROOM)
+    assert_one_way(graph())
+
+
+@pytest.mark.parametrize(
+    "circle", [{"cli.main": {"cli.bench"}, "cli.bench": {"cli.main"}}, {"run.folder": {"bench.grid"}}]
+)
+def test_a_circle_is_noticed(circle: dict[str, set[str]]) -> None:
+    broken = {name: others | circle.get(name, set()) for name, others in graph().items()}
+    with pytest.raises((graphlib.CycleError, AssertionError)):
+        assert_one_way(broken)
+
+
+def test_few_rooms_and_arrows() -> None:
+    assert len(ROOM) <= 16
+    assert len(arrows(graph())) <= 60
 
 
 def test_agents_know_no_environment_replay_or_loop() -> None:
-    for file in (SOURCE / "agents").glob("*.py"):
-        forbidden = {"envs", "wrappers", "replay", "acting", "learning", "training", "evaluation", "runs"}
-        assert not {name.split(".")[0] for name in imports(file)} & forbidden, file
+    for name, others in graph().items():
+        if room(name) == "agents":
+            assert not {room(other) for other in others} & {"envs", "wrappers", "run", "play", "training"}, name
+            assert "core.replay" not in others, name
 
 
 def test_loop_names_no_algorithm() -> None:
-    for name in ("acting", "learning", "training", "evaluation", "replay"):
-        words = (SOURCE / f"{name}.py").read_text().lower()
-        assert not [agent for agent in ("vdpo", "bpql", "dcac", "dida", "adsac", "lifting") if agent in words]
+    agents = ("vdpo", "bpql", "dcac", "dida", "adsac", "lifting")
+    for file in [*(SOURCE / "training").glob("*.py"), SOURCE / "core/replay.py", SOURCE / "play/evaluation.py"]:
+        code = [line for line in file.read_text().lower().splitlines() if "preset" not in line]
+        assert not [agent for agent in agents if agent in "\n".join(code)], file
 
 
 def test_files_stay_readable() -> None:
-    for file in (SOURCE / "agents").glob("*.py"):
-        assert len(file.read_text().splitlines()) <= 260, file
-    path = ["config", "agents/__init__", "agents/base", "agents/sac", "types", "views", "replay", "networks"]
-    path += ["objectives", "acting", "learning"]  # SAC from its configuration to its gradient
-    assert sum(len((SOURCE / f"{name}.py").read_text().splitlines()) for name in path) <= 1200
+    for name, file in modules().items():
+        text = file.read_text()
+        assert len(text.splitlines()) <= (260 if room(name) == "agents" else 350), name
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ClassDef):
+                assert node.end_lineno - node.lineno < 160, f"{name}: {node.name}"
+
+
+def test_sac_is_read_in_one_sitting() -> None:
+    """From its configuration to its gradient, the loop included."""
+    path = "run/configuration run/condition agents/registry agents/base agents/sac core/protocol core/types core/views "
+    path += "core/replay core/networks core/objectives training/train training/state training/actor training/learner "
+    path += "training/loop"
+    assert sum(len((SOURCE / f"{name}.py").read_text().splitlines()) for name in path.split()) <= 1750
+
+
+def test_light_modules_import_no_jax() -> None:
+    code = f"import sys; {'; '.join(f'import delayrl.{name}' for name in LIGHT)}; print('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+
+
+def test_the_architecture_page_names_what_exists() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text()
+    names = re.findall(r"`([\w/]+\.py):([\w.]+)`", page)
+    assert len(names) > 20
+    for file, dotted in names:
+        body: list[ast.stmt] = ast.parse((SOURCE / file).read_text()).body
+        for name in dotted.split("."):
+            defined = [node for node in body if getattr(node, "name", None) == name]
+            assert defined, f"{file} defines no {dotted}"
+            body = getattr(defined[0], "body", [])
+    for folder in re.findall(r"^\| `(\w+)` \|", page.split("## Five values")[0], re.MULTILINE):
+        assert folder in ROOM
+    assert f"`{'`, `'.join(ROOMS.split()[:-2])}`" in " ".join(page.split())

@@ -70,7 +70,7 @@ class ADSAC:
 
     def phases(self) -> tuple[Phase, ...]:
         """One: the update."""
-        return (Phase(self.learner.update_every, self.learner.updates, self.learner.batch_size, self.update),)
+        return (self.learner.phases()[0]._replace(update=self.update),)
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
         """The auxiliary actor, where it is free of delay."""

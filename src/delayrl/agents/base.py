@@ -56,38 +56,30 @@ class Agent(Protocol):
 
     def __hash__(self) -> int:
         """Equal hyperparameters share what is compiled."""
-        ...
 
     @property
     def privileged(self) -> bool:
         """Whether its behaviour reads the true current state while it trains."""
-        ...
 
     def ahead(self, spec: Spec) -> int:
         """How many steps after t its windows reach."""
-        ...
 
     def phases(self) -> tuple[Phase, ...]:
         """What it learns, and when."""
-        ...
 
     # An agent whose own schedule must fit the run's also has `check(schedule)`, which raises DelayRLError.
 
     def init(self, spec: Spec, key: Key) -> State:
         """A fresh state. Raises DelayRLError where the agent does not suit the task."""
-        ...
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """An action in [-1, 1]; without `explore` deterministic, and `seen.truth` is None."""
-        ...
 
     def reference_policy(self, state: State) -> "tuple[Agent, State] | None":
         """The delay-free policy inside it, where there is one: evaluated beside it, without delay."""
-        ...
 
     def deterministic(self, state: State) -> Deterministic:
         """The networks that `act` without `explore` consists of. Raises DelayRLError where there are none."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -105,15 +105,9 @@ class DCAC:
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """One step of actor and critics together; then of the targets."""
-        (actor, critic), opt_state, _, metrics = descend(
-            optax.adam(self.learning_rate),
-            self.loss,
-            (state.actor, state.critic),
-            state.opt_state,
-            state.target,
-            windows,
-            key,
-        )
+        adam, params = optax.adam(self.learning_rate), (state.actor, state.critic)
+        batch = state.target, windows, key
+        (actor, critic), opt_state, _, metrics = descend(adam, self.loss, params, state.opt_state, *batch)
         target = optax.incremental_update(critic, state.target, self.target_rate)
         return State(actor, critic, target, opt_state), metrics
 

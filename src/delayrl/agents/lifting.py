@@ -61,7 +61,7 @@ class Lifting:
 
     def phases(self) -> tuple[Phase, ...]:
         """One: the update."""
-        return (Phase(self.bpql.update_every, self.bpql.updates, self.bpql.batch_size, self.update),)
+        return (self.bpql.phases()[0]._replace(update=self.update),)
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
         """The delay-free SAC that the delayed policy is pulled towards."""
@@ -97,9 +97,8 @@ class Lifting:
         reference_key, delayed_key = jax.random.split(key)
         # the temperature is moved by the delayed policy's entropy alone: what the reference makes of it is dropped
         shared = state.delayed.log_temperature
-        reference, of_reference = self.reference.update(
-            state.reference._replace(log_temperature=shared), windows, reference_key, count
-        )
+        reference = state.reference._replace(log_temperature=shared)
+        reference, of_reference = self.reference.update(reference, windows, reference_key, count)
         towards = self.bpql.policy(reference.actor, windows.obs[:, windows.delay])
         weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
         before = self.bpql.policy(state.delayed.actor, jax.vmap(lambda window: look(window, "augmented"))(windows))

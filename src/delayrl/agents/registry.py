@@ -41,61 +41,57 @@ class Registration(NamedTuple):
 
 _CLEARED = replace(OFFICIAL, last_starts="dropped")
 """Released code whose n-step window is cleared at the end of an episode."""
-_PAPER = Schedule()
-_SMALL = Schedule(
-    steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500, evaluation_episodes=10
-)
+_SMALL = Schedule(steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500)
+
+
+def _presets(paper: Agent, small: Agent, random_steps: int = 5_000) -> dict[str, Preset]:
+    """The paper's own hyperparameters, with its random steps; and small ones, for minutes on a laptop."""
+    return {"paper": Preset(paper, Schedule(random_steps=random_steps)), "small": Preset(small, _SMALL)}
 
 
 def _soft(summary: str, paper: str, **sees: str) -> Registration:
-    """SAC on two views: it differs in what is seen alone, so that nothing else explains a difference."""
+    """SAC on two views: it differs in what is seen alone, so nothing else explains a difference."""
     agent = SAC(**sees)  # type: ignore[arg-type]
-    presets = {"paper": Preset(agent, _PAPER), "small": Preset(replace(agent, batch_size=128), _SMALL)}
-    return Registration(summary, paper, presets)
+    return Registration(summary, paper, _presets(agent, replace(agent, batch_size=128)))
 
 
-_small_vdpo = VDPO(
-    SAC(batch_size=128), width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250
-)
-_small_adsac = ADSAC(SAC(actor_sees="augmented", critic_sees="augmented", batch_size=128))
-_small_lifting = Lifting(SAC(actor_sees="augmented", batch_size=128), lifting_hold=3_750, lifting_end=11_250)
-_small_dida = DIDA(SAC(batch_size=128), expert_steps=10_000, round_steps=250, imitation_updates=250)
+_SMALL_SAC = SAC(batch_size=128)
+_SMALL_BPQL = replace(_SMALL_SAC, actor_sees="augmented")
+_SMALL_VDPO = VDPO(_SMALL_SAC, width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250)
+_SMALL_DIDA = DIDA(_SMALL_SAC, expert_steps=10_000, round_steps=250, imitation_updates=250)
 
 AGENTS: dict[str, Registration] = {
     "vdpo": Registration(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
-        {"paper": Preset(VDPO(), _PAPER), "small": Preset(_small_vdpo, _SMALL)},
-        official=_CLEARED,
+        _presets(VDPO(), _SMALL_VDPO),
+        _CLEARED,
     ),
     "lifting": Registration(
         "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
         "Lee et al., 2026, arXiv 2604.03641",
-        {"paper": Preset(Lifting(), replace(_PAPER, random_steps=10_000)), "small": Preset(_small_lifting, _SMALL)},
+        _presets(Lifting(), Lifting(_SMALL_BPQL, lifting_hold=3_750, lifting_end=11_250), random_steps=10_000),
     ),
     "ad-sac": Registration(
         "learns values for a shorter delay, and improves the actor of the long one by them",
         "Wu et al., ICML 2024",
-        {"paper": Preset(ADSAC(), _PAPER), "small": Preset(_small_adsac, _SMALL)},
-        official=replace(_CLEARED, overrides={"evaluation": "sample"}),
+        _presets(ADSAC(), ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))),
+        replace(_CLEARED, overrides={"evaluation": "sample"}),
     ),
     "dida": Registration(
         "a student on x_t imitates a delay-free SAC expert (DAgger); the expert's steps are counted",
         "Liotet et al., ICML 2022",
-        {"paper": Preset(DIDA(), _PAPER), "small": Preset(_small_dida, _SMALL)},
+        _presets(DIDA(), _SMALL_DIDA),
     ),
     "dcac": Registration(
         "learns values on past stretches whose actions are sampled again inside the augmented state",
         "Bouteiller, Ramstedt et al., ICLR 2021",
-        {"paper": Preset(DCAC(), replace(_PAPER, random_steps=10_000)), "small": Preset(DCAC(), _SMALL)},
+        _presets(DCAC(), DCAC(), random_steps=10_000),
     ),
     "bpql": Registration(
         "SAC whose actor sees x_t and whose critic sees s_t",
         "Kim et al., NeurIPS 2023",
-        {
-            "paper": Preset(BPQL, replace(_PAPER, random_steps=10_000)),
-            "small": Preset(SAC(actor_sees="augmented", batch_size=128), _SMALL),
-        },
+        _presets(BPQL, _SMALL_BPQL, random_steps=10_000),
     ),
     "a-sac": _soft(
         "SAC on the augmented state x_t = (last observation, actions since)",
@@ -110,11 +106,7 @@ AGENTS: dict[str, Registration] = {
         critic_sees="delayed",
     ),
     "sac": _soft("the delay-free reference: trains with --delay 0", "Haarnoja et al., ICML 2018"),
-    "random": Registration(
-        "uniform actions",
-        "-",
-        {name: Preset(Random(), s) for name, s in (("paper", _PAPER), ("small", _SMALL))},
-    ),
+    "random": Registration("uniform actions", "-", _presets(Random(), Random())),
 }
 
 

@@ -44,6 +44,15 @@ class State(NamedTuple):
     temperature_opt_state: optax.OptState
 
 
+Penalty = Callable[[Gaussian], Array]
+"""Added to the actor's loss, a function of its policy at the batch: for agents built on this one."""
+
+
+def no_penalty(policy: Gaussian) -> Array:
+    """SAC's own."""
+    return jnp.zeros(())
+
+
 @dataclass(frozen=True)
 class SAC:
     """Hyperparameters of soft actor-critic; the defaults are VDPO's (appendix, table of hyperparameters)."""
@@ -94,9 +103,8 @@ class SAC:
         actor_key, critic_key = jax.random.split(key)
         sizes = (input_size(spec, self.actor_sees), *self.hidden, 2 * spec.action_size)
         actor = networks.mlp_init(actor_key, sizes)
-        critic = networks.twin_init(
-            critic_key, (input_size(spec, self.critic_sees) + spec.action_size, *self.hidden, 1)
-        )
+        sizes = (input_size(spec, self.critic_sees) + spec.action_size, *self.hidden, 1)
+        critic = networks.twin_init(critic_key, sizes)
         log_temperature = jnp.log(jnp.asarray(self.initial_temperature, jnp.float32))
         return State(
             actor,
@@ -122,17 +130,9 @@ class SAC:
         return Deterministic(self.actor_sees, state.actor)
 
     def update(
-        self,
-        state: State,
-        windows: Window,
-        key: Key,
-        count: Int[Array, ""],
-        penalty: Callable[[Gaussian], Array] | None = None,
+        self, state: State, windows: Window, key: Key, count: Int[Array, ""], penalty: Penalty = no_penalty
     ) -> tuple[State, Metrics]:
-        """One critic update; every `actor_every`-th time the actor and the temperature, on the same batch.
-
-        `penalty` is added to the actor's loss: a function of its policy at the batch, for agents built on this one.
-        """
+        """One critic update; every `actor_every`-th time the actor and the temperature, on the same batch."""
         target_key, actor_key = jax.random.split(key)
         actor_now, critic_now = self._inputs(windows, 0)
         actor_next, critic_next = self._inputs(windows, windows.n_step)
@@ -164,26 +164,14 @@ class SAC:
             jnp.take_along_axis(windows.terminated, last[:, None], 1)[:, 0],
             next_value,
         )
-        critic, critic_opt_state, loss, q = descend(
-            optax.adam(self.critic_learning_rate),
-            critic_loss,
-            state.critic,
-            state.critic_opt_state,
-            critic_input,
-            windows.action[:, now],
-            y,
-        )
+        adam, batch = optax.adam(self.critic_learning_rate), (critic_input, windows.action[:, now], y)
+        critic, opt_state, loss, q = descend(adam, critic_loss, state.critic, state.critic_opt_state, *batch)
         target = optax.incremental_update(critic, state.target, self.target_rate)
-        state = state._replace(critic=critic, critic_opt_state=critic_opt_state, target=target)
+        state = state._replace(critic=critic, critic_opt_state=opt_state, target=target)
         return state, {"critic_loss": loss, "q": q}
 
     def improve_actor(
-        self,
-        state: State,
-        actor_input: Array,
-        critic_input: Array,
-        key: Key,
-        penalty: Callable[[Gaussian], Array] | None = None,
+        self, state: State, actor_input: Array, critic_input: Array, key: Key, penalty: Penalty = no_penalty
     ) -> State:
         """One step of the actor towards higher soft values (VDPO eq. 9)."""
         temperature = jnp.exp(state.log_temperature)
@@ -192,24 +180,23 @@ class SAC:
             policy = self.policy(actor, actor_input)
             action, log_prob = networks.sample(policy, key)
             value = soft_value(networks.twin(state.critic, critic_input, action), log_prob, temperature)
-            return -value.mean() + (penalty(policy) if penalty else 0.0), None
+            return penalty(policy) - value.mean(), None
 
-        actor, actor_opt_state, _, _ = descend(
-            optax.adam(self.actor_learning_rate), loss, state.actor, state.actor_opt_state
-        )
-        return state._replace(actor=actor, actor_opt_state=actor_opt_state)
+        adam = optax.adam(self.actor_learning_rate)
+        actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)
+        return state._replace(actor=actor, actor_opt_state=opt_state)
 
     def adjust_temperature(self, state: State, actor_input: Array, action_size: int, key: Key) -> State:
         """One step of the temperature towards the target entropy, on a sample of its own."""
         target_entropy = self.entropy_per_action * action_size
         _, log_prob = networks.sample(self.policy(state.actor, actor_input), key)
-        log_temperature, temperature_opt_state, _, _ = descend(
-            optax.adam(self.temperature_learning_rate),
-            lambda log_temperature: (temperature_loss(log_temperature, log_prob, target_entropy), None),
-            state.log_temperature,
-            state.temperature_opt_state,
-        )
-        return state._replace(log_temperature=log_temperature, temperature_opt_state=temperature_opt_state)
+
+        def loss(log_temperature: Array) -> tuple[Array, None]:
+            return temperature_loss(log_temperature, log_prob, target_entropy), None
+
+        adam = optax.adam(self.temperature_learning_rate)
+        log_temperature, opt_state, _, _ = descend(adam, loss, state.log_temperature, state.temperature_opt_state)
+        return state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
 
     def _inputs(self, windows: Window, ahead: int | Array) -> tuple[Array, Array]:
         """What actor and critic see `ahead` steps after t, for each window."""

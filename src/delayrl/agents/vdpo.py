@@ -148,29 +148,17 @@ class VDPO:
         state = state._replace(reference=reference)
         if self.representation != "transformer":
             return state, metrics
-        (encoder, decoder), opt_state, loss, _ = descend(
-            optax.adam(self.learning_rate),
-            self.belief_loss,
-            (state.encoder, state.decoder),
-            state.belief_opt_state,
-            unseen(windows),
-            dropout_key,
-        )
-        return state._replace(encoder=encoder, decoder=decoder, belief_opt_state=opt_state), metrics | {
-            "belief_loss": loss
-        }
+        adam, params = optax.adam(self.learning_rate), (state.encoder, state.decoder)
+        batch = unseen(windows), dropout_key
+        (encoder, decoder), opt_state, loss, _ = descend(adam, self.belief_loss, params, state.belief_opt_state, *batch)
+        state = state._replace(encoder=encoder, decoder=decoder, belief_opt_state=opt_state)
+        return state, metrics | {"belief_loss": loss}
 
     def clone(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """(B) One KL update of the policy head towards the reference (eq. 11); the encoder stays where it is."""
-        cloned, opt_state, loss, _ = descend(
-            optax.adam(self.learning_rate),
-            self.clone_loss,
-            self._cloned(state.encoder, state.head),
-            state.clone_opt_state,
-            state,
-            unseen(windows),
-            key,
-        )
+        adam, params = optax.adam(self.learning_rate), self._cloned(state.encoder, state.head)
+        batch = state, unseen(windows), key
+        cloned, opt_state, loss, _ = descend(adam, self.clone_loss, params, state.clone_opt_state, *batch)
         return state._replace(**cloned, clone_opt_state=opt_state), {"kl": loss}
 
     def policy(self, state: State, obs: Array, actions: Array, key: Key | None = None) -> Gaussian:

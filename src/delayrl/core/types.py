@@ -4,8 +4,7 @@ Axis names: `obs` (S) and `action` (A) are a task's sizes, `delay` is Δ, the lo
 (Δ + 1 + ahead). Leading axes (seeds, a batch) are added by `jax.vmap`; the code is written for one.
 """
 
-import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -55,11 +54,7 @@ class Transition(NamedTuple):
     next_age: Int[Array, ""]
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["obs", "age", "action", "reward", "terminated", "valid", "lead", "n_step"],
-    meta_fields=["delay"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Window:
     """A stretch of one episode around the step t that is learned from; t stands at index Δ.
@@ -76,4 +71,4 @@ class Window:
     valid: Bool[Array, " time"]
     lead: Int[Array, ""]
     n_step: Int[Array, ""]
-    delay: int
+    delay: int = field(metadata={"static": True})

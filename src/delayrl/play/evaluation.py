@@ -32,14 +32,8 @@ class Episodes(NamedTuple):
 class Evaluator:
     """Plays episodes of all seeds beside each other, with one call of the policy for each step of all of them.
 
-    Args:
-        agent: whose policy is played.
-        spec: the task as the agent was trained on it.
-        env: id of the task.
-        delay: under which it is played, no longer than `spec.delay`. A text or number for `make`.
-        seeds: length of the seed axis of the states.
-        episodes: how many for each seed.
-        apply: `map`, or that of a pool of threads, which steps the environments beside each other.
+    `spec` is the task as the agent was trained on it; it is played under `delay`, which may be shorter. `apply` is
+    `map`, or that of a pool of threads, which steps the environments beside each other.
     """
 
     def __init__(
@@ -65,17 +59,10 @@ class Evaluator:
         first: NDArray[np.float32] | None = None,
         travel_seeds: Sequence[Sequence[int]] | None = None,
     ) -> Episodes:
-        """Play one episode from each reset seed.
+        """Play one episode from each reset seed, [seeds, episodes].
 
-        Args:
-            states: the agents, with a seed axis.
-            reset_seeds: of the start states, [seeds, episodes].
-            keys: of the seeds; for policies that sample.
-            first: the first actions, [seeds, episodes, A], if they are not the policy's.
-            travel_seeds: of the travel times, [seeds, episodes], if they are not those of the start states.
-
-        Raises:
-            DelayRLError: a reward or an observation that is not finite.
+        `first` are the first actions, [seeds, episodes, A], if they are not the policy's; `travel_seeds` the seeds of
+        the travel times, if they are not those of the start states. Raises DelayRLError for what is not finite.
         """
         shape = (len(self._envs), len(self._envs[0]))
         returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
@@ -96,9 +83,7 @@ class Evaluator:
             played = self._apply(self._step, alive, [actions[at] for at in alive])
             for (i, j), (obs, reward, terminated, truncated, info) in zip(alive, played, strict=True):
                 if not (np.isfinite(reward) and np.isfinite(info["truth"]).all()):
-                    raise DelayRLError(
-                        "the environment gave a reward or an observation that is not finite in evaluation"
-                    )
+                    raise DelayRLError("the environment gave a number that is not finite in evaluation")
                 returns[i, j] += float(reward)
                 lengths[i, j] += 1
                 running[i, j] = not (terminated or truncated)

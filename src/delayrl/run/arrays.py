@@ -45,13 +45,7 @@ def flatten_tree(tree: Any) -> Arrays:
 def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
     """Return a pytree of the template's form with stored leaves.
 
-    Args:
-        template: a pytree of arrays, or of their shapes and types.
-        arrays: leaves by name, as `flatten_tree` gives them.
-        where: the file or folder that an error names.
-
-    Raises:
-        DelayRLError: a leaf is missing, left over, or of another shape or type.
+    Raises DelayRLError, naming `where`, if a leaf is missing, left over, or of another shape or type.
     """
     import jax
 

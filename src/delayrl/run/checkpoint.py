@@ -8,31 +8,28 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from delayrl.errors import DelayRLError
-from delayrl.run.arrays import Arrays, load_arrays
+
+if TYPE_CHECKING:
+    from delayrl.run.arrays import Arrays
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint, as its manifest describes it.
-
-    Attributes:
-        path: its folder.
-        step: the environment steps of each seed that it holds.
-        complete: whether it is the last of a finished run.
-        files: checksums of its own files.
-        pieces: checksums of the files in replay/ that it needs.
-    """
+    """A checkpoint, as its manifest describes it."""
 
     path: Path
     step: int
-    complete: bool
-    files: dict[str, str]
-    pieces: dict[str, str]
+    complete: bool  # whether it is the last of a finished run
+    files: dict[str, str]  # checksums of its own files
+    pieces: dict[str, str]  # checksums of the files in replay/ that it needs
 
-    def arrays(self, name: str) -> Arrays:
+    def arrays(self, name: str) -> "Arrays":
         """Read one of its files: "agent" or "loop"."""
+        from delayrl.run.arrays import load_arrays  # NumPy only where arrays are read: `bench status` starts faster
+
         return load_arrays(self.path / f"{name}.safetensors")
 
     def check(self) -> None:

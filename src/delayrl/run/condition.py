@@ -28,24 +28,15 @@ KINDS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """One agent with its hyperparameters, on one task, under one delay and one protocol.
+    """One agent with its hyperparameters, on one task, under one delay and one protocol."""
 
-    Attributes:
-        agent: its name in the registry.
-        env: the id of the task.
-        delay: environment steps, or a delay's text.
-        preset, protocol: their names.
-        overrides: hyperparameters and schedule options that differ from the preset's.
-        steps: environment steps that each seed trains; 0 where that is unknown.
-    """
-
-    agent: str
-    env: str
-    delay: int | str
+    agent: str  # its name in the registry
+    env: str  # the id of the task
+    delay: int | str  # environment steps, or a delay's text
     preset: str = "paper"
     protocol: str = "corrected"
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    steps: int = 0
+    overrides: Mapping[str, Any] = field(default_factory=dict)  # options that differ from the preset's
+    steps: int = 0  # environment steps that each seed trains; 0 where that is unknown
 
     @property
     def label(self) -> int | str:

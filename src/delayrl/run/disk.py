@@ -12,12 +12,9 @@ from delayrl.errors import DelayRLError
 
 @contextlib.contextmanager
 def draft(path: Path, *, shared: bool = False) -> Iterator[Path]:
-    """Yield the path of a draft beside `path`; rename it into place when the block ends, delete it if it raises.
+    """Yield the path of a draft, a file or a folder; rename it into place when the block ends, delete it if it raises.
 
-    Args:
-        path: what is to be written, a file or a folder (then there must be none of this name yet).
-        shared: whether several processes may write it at the same time. Else a draft that a killed process left
-            behind is overwritten by the next.
+    If `shared`, several processes may write it at the same time. Else the next overwrites what a killed one left.
     """
     name = path.with_name(f".{path.name}-{os.getpid()}.draft" if shared else f".{path.name}.draft")
     remove(name)

@@ -25,15 +25,8 @@ from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoi
 from delayrl.run.disk import disk_errors, draft, remove, write_file, write_flushed
 
 FORMAT = 1
-CONFIG = {
-    "format": int,
-    "agent": str,
-    "preset": str,
-    "env": str,
-    "delay": int | str,
-    "hyperparameters": dict,
-    "schedule": dict,
-}
+NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
+CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 FILES = ("rows.jsonl", "metrics.jsonl", "curve.png", "delays.png", "config.json")
@@ -135,15 +128,7 @@ class Run:
     def save(
         self, step: int, agent: Arrays, loop: Arrays | None, pieces: dict[str, str], *, complete: bool = False
     ) -> None:
-        """Write a checkpoint, and delete all but the one before it.
-
-        Args:
-            step: environment steps of the seed so far.
-            agent: the agent's state.
-            loop: what a resumed run needs besides; None for a complete one.
-            pieces: checksums of the replay's files.
-            complete: whether training is over.
-        """
+        """Write a checkpoint, and delete all but the one before it. `loop` is what a resumed run needs besides."""
         final = self.path / "checkpoints" / f"{step:012d}"
         with disk_errors(self.path):
             final.parent.mkdir(parents=True, exist_ok=True)

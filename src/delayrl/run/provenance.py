@@ -15,18 +15,16 @@ def commit() -> str | None:
 
     A package that is installed into a folder of another project's checkout is not in that checkout.
     """
-    here = Path(__file__).parent
+    package = Path(__file__).parents[1]
 
     def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
-        ).stdout.strip()
+        command = ["git", "-C", str(package), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # else it is somebody else's checkout
-        return git("rev-parse", "--short=12", "HEAD") + (
-            "-changed" if git("status", "--porcelain", "--", str(here)) else ""
-        )
+        git("ls-files", "--error-unmatch", __file__)  # else it is somebody else's checkout
+        changed = git("status", "--porcelain", "--", str(package))
+        return git("rev-parse", "--short=12", "HEAD") + ("-changed" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return None
 
@@ -39,9 +37,6 @@ def versions() -> dict[str, Any]:
             used[package] = version(package)
         except PackageNotFoundError:
             used[package] = None
-    used["commit"] = commit()
     (device,) = jnp.zeros(()).devices()  # where arrays are made now, which `--device cpu` changes
-    used["device"] = device.device_kind
-    used["cores"] = os.cpu_count()
-    used["machine"] = f"{platform.system()} {platform.machine()}"
-    return used
+    machine = f"{platform.system()} {platform.machine()}"
+    return used | {"commit": commit(), "device": device.device_kind, "cores": os.cpu_count(), "machine": machine}

@@ -14,21 +14,10 @@ from delayrl.wrappers import Delayed
 
 
 class Actor:
-    """One seed's environment in its current episode.
-
-    Attributes:
-        env: the delayed task, with actions in [-1, 1].
-        seed: the run's.
-        privileged: whether the agent's behaviour reads the true state.
-        protocol: how episodes start, and what a time limit means.
-        episode: the number of the current episode.
-        actions: those taken in it so far.
-        seen: what the agent sees now.
-        truth: the true observation now, [S].
-    """
+    """One seed's environment in its current episode: its number, and the actions taken in it so far."""
 
     seen: Seen
-    truth: NDArray[np.float32]
+    truth: NDArray[np.float32]  # the true observation now, [S]
 
     def __init__(self, env: Delayed, seed: int, privileged: bool, protocol: Protocol = CORRECTED) -> None:
         self.env, self.seed, self.privileged, self.protocol = env, seed, privileged, protocol

@@ -28,14 +28,8 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
     only, so updates then run there, instead of on a thread of JAX's. That gives up computing beside the host's work,
     which costs small updates more than it saves.
 
-    Args:
-        agent: whose updates are measured, from their shapes.
-        spec: sizes of the task.
-        seeds: how many are trained in lockstep.
-
-    Returns:
-        Whether buffers are kept from now on, in this process. Never without glibc, off the main thread, or for small
-        updates. No result depends on it.
+    Returns whether buffers are kept from now on, in this process: never without glibc, off the main thread, or for
+    small updates. No result depends on it.
     """
     if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
         return False

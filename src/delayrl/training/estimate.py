@@ -17,12 +17,11 @@ UTILISATION = 0.25
 
 def estimate(group: Group, state: TrainState) -> str:
     """Return in words how long the rest of a run will take on this device."""
-    left = group.setup.schedule.steps - state.step
-    hours = _seconds(group, state) / 3600
+    hours, steps = _seconds(group, state) / 3600, group.setup.schedule.steps - state.step
     if hours < 0.5:
-        return f"about {max(1, round(hours * 60))} min for {left:,} steps on this device"
+        return f"about {max(1, round(hours * 60))} min for {steps:,} steps on this device"
     advice = "; --preset small takes minutes" if group.setup.condition.preset == "paper" else ""
-    return f"about {hours:.1f} h for {left:,} steps on this device{advice}"
+    return f"about {hours:.1f} h for {steps:,} steps on this device{advice}"
 
 
 def _seconds(group: Group, state: TrainState) -> float:

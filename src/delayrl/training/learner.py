@@ -36,11 +36,6 @@ class Program:
     """The jitted functions of one agent on one task. Every argument but `step` has a leading seed axis.
 
     Get one from `compiled`: it returns the same functions for the same agent and task.
-
-    Args:
-        agent: the agent.
-        spec: sizes of the task.
-        min_episode_steps: as `replay.append` has it.
     """
 
     def __init__(self, agent: Agent, spec: Spec, min_episode_steps: int = 1) -> None:
@@ -65,17 +60,9 @@ class Program:
     ) -> tuple[Learner, Metrics, bool]:
         """Store the newest steps and run the phases that are due at them, without waiting. Donates `learner`.
 
-        If the first phase is due at every step, it runs after each is stored. All other phases run at the end.
-
-        Args:
-            learner: agents and replays.
-            pending: the newest steps, [steps][seeds].
-            keys: of the seeds.
-            last: the number of the last of these steps.
-            random_steps: no phase is due before that step.
-
-        Returns:
-            The new learner, its metrics, and whether anything was due.
+        `pending` are steps, [steps][seeds], up to number `last`. Nothing is due before step `random_steps`. If the first
+        phase is due at every step, it runs after each is stored; all others run at the end. Returns the new learner,
+        its metrics, and whether anything was due.
         """
         steps = range(last - len(pending) + 1, last + 1)
         due = [self._due(step) if step >= random_steps else [] for step in steps]
@@ -86,9 +73,7 @@ class Program:
         learner, metrics = self._jitted_learn(learner, block, keys, np.array(steps, np.int32), first_phase=first_phase)
         for step, phases in zip(steps, due, strict=True):
             for index in phases[1:] if first_phase else phases:
-                learner, more = self._jitted_update(
-                    learner, block.hidden[-1], keys, np.int32(step), index=index
-                )
+                learner, more = self._jitted_update(learner, block.hidden[-1], keys, np.int32(step), index=index)
                 metrics = metrics | more
         return learner, metrics, any(due)
 

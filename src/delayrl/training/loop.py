@@ -33,14 +33,7 @@ METRICS_EVERY = 1000
 def run(
     group: Group, state: TrainState, note: Callable[[str], None], *, progress: bool = False, track: str | None = None
 ) -> None:
-    """Train from a state to the end, and draw the learning curves.
-
-    Args:
-        group: what is trained.
-        state: where it stands; it is used up.
-        note: takes lines for people.
-        progress: whether to show a progress bar and an estimate of the time.
-        track: a service that gets the scalars too, or None.
+    """Train from a state, which is used up, to the end; and draw the learning curves.
 
     Raises:
         StoppedError: the process was asked to stop; the newest step is stored.
@@ -51,15 +44,9 @@ def run(
         recorder = Recorder(group, state.learner.agent, state.actors[0].env, track)
         if progress:
             note(f"estimate: {estimate(group, state)}")
-        bar = tqdm(
-            total=steps,
-            initial=state.step,
-            unit="step",
-            disable=not progress,
-            smoothing=0.05,
-            dynamic_ncols=True,
-            mininterval=0.5 if sys.stderr.isatty() else 30,
-        )
+        interval = 0.5 if sys.stderr.isatty() else 30
+        options = {"disable": not progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
+        bar = tqdm(total=steps, initial=state.step, unit="step", **options)
         with stop_signal() as stop, bar:
             Loop(group, state, recorder).train(stop.is_set, bar)
     for folder in group.runs:

@@ -16,14 +16,7 @@ from delayrl.training.tracking import Tracker
 
 
 class Recorder:
-    """Evaluates a group of seeds and writes rows and metrics.
-
-    Args:
-        group: what is trained.
-        agent: its state, of which only the structure matters here.
-        env: the environment that the rows' physics is read from.
-        track: a service that gets the scalars too, or None.
-    """
+    """Evaluates a group of seeds and writes rows and metrics; to a tracking service too, if `track` names one."""
 
     def __init__(self, group: Group, agent: State, env: Any, track: str | None) -> None:
         self._group = group

@@ -28,13 +28,7 @@ KEPT = "the last good checkpoint is kept"
 
 
 def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
-    """Create the run folders, or resume from what they hold.
-
-    Args:
-        group: what is trained.
-        actors: of each seed, at the start of the first episode.
-        overwrite: whether to delete runs that are there.
-        note: takes lines for people.
+    """Create the run folders, or resume from what they hold. `note` takes lines for people.
 
     Raises:
         DelayRLError: another run or other files in a folder, no common checkpoint, a damaged one.
@@ -103,11 +97,7 @@ def _check_same(run: Run, wanted: dict[str, Any]) -> None:
 
 
 def restore(group: Group, fresh: TrainState, checkpoints: list[Checkpoint]) -> TrainState:
-    """Return the state that the seeds' checkpoints hold, with the arrays and environments of a fresh one.
-
-    Raises:
-        DelayRLError: a file of another agent, a damaged file, an environment that does not repeat an episode.
-    """
+    """Return the state in the seeds' checkpoints. Raises DelayRLError if one does not fit, or an episode differs."""
     states = [restore_tree(group.template, c.arrays("agent"), c.path) for c in checkpoints]
     agent = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
     step = checkpoints[0].step
@@ -148,11 +138,7 @@ def _pending(loop: Arrays) -> list[Stored]:
 
 
 def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainState:
-    """Write a checkpoint of each seed, of its replay only what is new. Returns the state with what is stored.
-
-    Raises:
-        DelayRLError: weights that are not finite, a full disk.
-    """
+    """Write a checkpoint of each seed, of its replay only what is new. Returns the state with what is stored."""
     if state.step == 0:
         return state
     agent = jax.device_get(state.learner.agent)

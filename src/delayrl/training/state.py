@@ -17,45 +17,26 @@ from delayrl.training.learner import Learner, Program, Stored
 
 @dataclass(frozen=True)
 class Group:
-    """The seeds that one call trains in lockstep, and what they share.
-
-    Attributes:
-        setup: what is trained, on what.
-        seeds, runs, keys: of each seed its number, folder and random key.
-        spec: sizes of the task.
-        template: shapes and types of the agent's state.
-        program: the compiled functions.
-        apply: `map`, or that of a pool of threads, which steps environments beside each other.
-    """
+    """The seeds that one call trains in lockstep, and what they share."""
 
     setup: Setup
     seeds: list[int]
-    runs: list[Run]
-    keys: Key
+    runs: list[Run]  # one folder for each seed
+    keys: Key  # one random key for each seed
     spec: Spec
-    template: State
+    template: State  # shapes and types of the agent's state
     program: Program
-    apply: Callable[..., Iterator[Any]] = map
+    apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other
 
 
 @dataclass
 class TrainState:
-    """Where training stands; all that a checkpoint holds.
-
-    Attributes:
-        step: environment steps that each seed has taken.
-        learner: agents and replays of all seeds.
-        actors: the environments in their current episodes.
-        pending: the newest steps, which the learner has not been given yet, [steps][seeds].
-        actions: the next actions, [seeds, A], if they have been chosen already.
-        pieces: for each seed the files of its replay, with their checksums.
-        stored: for each seed the rows and the steps of its replay that these files hold.
-    """
+    """Where training stands; all that a checkpoint holds."""
 
     step: int
     learner: Learner
     actors: list[Actor]
-    pending: list[list[Stored]]
-    actions: NDArray[np.float32] | None
-    pieces: list[dict[str, str]]
-    stored: list[tuple[int, int]]
+    pending: list[list[Stored]]  # the newest steps, [steps][seeds], which the learner has not been given yet
+    actions: NDArray[np.float32] | None  # the next actions, [seeds, A], if they have been chosen already
+    pieces: list[dict[str, str]]  # for each seed the files of its replay, with their checksums
+    stored: list[tuple[int, int]]  # for each seed the rows and the steps of its replay that these files hold

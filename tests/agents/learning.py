@@ -1,0 +1,52 @@
+"""Agents trained for some steps, and windows to look at."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from conftest import learned, record
+from delayrl.core import replay as ring
+from delayrl.core.types import Seen, Spec
+from delayrl.training.learner import Program
+
+ENV, OBS, ACT = "Reacher-v5", 10, 2
+DELAYED = ["sac-memoryless", "a-sac", "bpql", "lifting", "ad-sac", "dcac", "dida", "vdpo"]
+
+
+@functools.cache
+def program_of(agent, delay: int) -> Program:
+    """Compiled once for all tests."""
+    return Program(agent, Spec(OBS, ACT, delay))
+
+
+def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=None):
+    """An agent's state after some environment steps with updates, as the loop makes them."""
+    transitions = transitions or record(ENV, delay, 120)[0]
+    program = program_of(agent, delay)
+    keys = jax.vmap(jax.random.key)(jnp.arange(1))
+    first_update = len(transitions) - updates + 1
+    *_, (learner, metrics) = learned(program, keys, [transitions], first_update, hidden=lambda step: hidden)
+    return learner, metrics, keys
+
+
+def counted(delay: int, steps: int, batch: int, ahead: int):
+    """Random play of the counter, and windows of it."""
+    transitions, _ = record("delayrl/Counter-v0", delay, steps)
+    replay = ring.init(Spec(2, 1, delay), 2 * steps)
+    for transition in transitions:
+        replay = jax.jit(ring.append)(replay, transition)
+    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+    return transitions, sample(replay, jax.random.key(0), batch, delay, ahead, jnp.int32(0))
+
+
+def same(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def seen(delay: int, age: int, rng: np.random.Generator, truth: bool = False) -> Seen:
+    actions = np.zeros((delay, ACT), np.float32)
+    actions[:age] = rng.uniform(-1, 1, (age, ACT))
+    obs = rng.normal(size=(2, OBS)).astype(np.float32)
+    return Seen(jnp.asarray(obs[0]), jnp.int32(age), jnp.asarray(actions), jnp.asarray(obs[1]) if truth else None)

@@ -1,0 +1,188 @@
+"""VDPO: what it clones from, its losses, its behaviour."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from learning import ACT, ENV, OBS, counted, same, seen
+
+from conftest import TINY, TINY_SAC, record
+from delayrl.agents.registry import AGENTS
+from delayrl.agents.vdpo import VDPO, Unseen, unseen
+from delayrl.core import networks
+from delayrl.core import replay as ring
+from delayrl.core.types import Spec
+
+
+def test_bfloat16_products_are_close(monkeypatch) -> None:
+    """`precision = bfloat16` rounds the inputs of products: what it does to a belief loss and its gradient."""
+    agent = VDPO(TINY_SAC, width=64, layers=3, dropout=0.0)
+    state = agent.init(Spec(OBS, ACT, 5), jax.random.key(0))
+    draw = jax.random.normal(jax.random.key(1), (64, OBS + 5 * ACT + 5 * OBS))
+    obs, actions, states = jnp.split(draw, [OBS, OBS + 5 * ACT], 1)
+    x = Unseen(obs, actions.reshape(64, 5, ACT), states.reshape(64, 5, OBS), jnp.ones((64, 5), bool))
+
+    def evaluated():
+        loss = jax.value_and_grad(agent.belief_loss, has_aux=True)
+        (value, _), gradient = loss((state.encoder, state.decoder), x, jax.random.key(0))
+        return float(value), np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient)])
+
+    value, gradient = evaluated()
+    exact = networks.linear
+    rounded = lambda x: x.astype(jnp.bfloat16).astype(jnp.float32)  # noqa: E731
+    for module in ("networks", "transformer"):
+        monkeypatch.setattr(
+            f"delayrl.core.{module}.linear",
+            lambda params, x: exact({"w": rounded(params["w"]), "b": params["b"]}, rounded(x)),
+        )
+    coarse_value, coarse = evaluated()
+    error = np.linalg.norm(coarse - gradient) / np.linalg.norm(gradient)
+    assert 0 < error < 0.02
+    assert abs(coarse_value / value - 1) < 1e-3
+
+
+def test_unseen_is_what_the_delay_hides() -> None:
+    """x_{t+1}: the states after its observation, in order, up to s_{t+1}; fewer at the start of an episode."""
+    transitions, windows = counted(4, 150, batch=400, ahead=3)
+    x = unseen(windows)
+    by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
+    for i in range(400):
+        step = by_action[float(windows.action[i, 4, 0])]
+        now, length = transitions[step].obs
+        count = min(int(now) + 1, 4)
+        np.testing.assert_array_equal(x.mask[i], [True] * count + [False] * (4 - count))
+        np.testing.assert_array_equal(x.obs[i], [now + 1 - count, length])
+        for j in range(count):
+            np.testing.assert_array_equal(x.states[i, j], [now + 2 - count + j, length])
+            np.testing.assert_array_equal(x.actions[i, j], transitions[step + 1 - count + j].action)
+
+
+def vdpo_parts(agent: VDPO, delay: int = 3):
+    transitions, _ = record(ENV, delay, 60)
+    spec = Spec(OBS, ACT, delay)
+    replay = ring.init(spec, 100)
+    for transition in transitions:
+        replay = jax.jit(ring.append)(replay, transition)
+    windows = ring.sample(replay, jax.random.key(0), 16, delay, 3, jnp.int32(0))
+    return agent.init(spec, jax.random.key(0)), windows
+
+
+@pytest.mark.parametrize("representation", ["transformer", "transformer-no-belief", "mlp"])
+def test_who_learns_what(representation: str) -> None:
+    """Belief trains encoder and decoder; cloning the head alone, and the encoder too where nothing else does."""
+    agent = dataclasses.replace(TINY["vdpo"], representation=representation)
+    state, windows = vdpo_parts(agent)
+    updated, metrics = agent.update(state, windows, jax.random.key(1), jnp.int32(0))
+    cloned, _ = agent.clone(state, windows, jax.random.key(1), jnp.int32(0))
+    believes = representation == "transformer"
+    assert ("belief_loss" in metrics) == believes
+    assert same(updated.encoder, state.encoder) != believes
+    assert same(updated.head, state.head)
+    assert not same(cloned.head, state.head)
+    assert same(cloned.encoder, state.encoder) != (representation == "transformer-no-belief")
+    assert same(cloned.reference, state.reference)
+    assert same(cloned.decoder, state.decoder)
+
+
+@pytest.mark.parametrize("representation", ["transformer", "mlp"])
+def test_one_network_serves_every_age(representation: str, rng: np.random.Generator) -> None:
+    """The action at age d is position d - 1's; padding has no influence; at age 0 the reference acts."""
+    agent = dataclasses.replace(TINY["vdpo"], representation=representation)
+    state, _ = vdpo_parts(agent, 4)
+    for age in range(1, 5):
+        what = seen(4, age, rng)
+        action = agent.act(state, what, jax.random.key(0), explore=False)
+        position = jnp.tanh(agent.policy(state, what.obs, what.actions).mean[age - 1])
+        np.testing.assert_allclose(action, position, atol=1e-6)
+        noisy = what._replace(actions=what.actions.at[age:].set(0.7))
+        np.testing.assert_allclose(agent.act(state, noisy, jax.random.key(0), explore=False), action, atol=1e-6)
+    what = seen(4, 0, rng)
+    reference = agent.reference.act(state.reference, what, jax.random.key(0), explore=False)
+    np.testing.assert_array_equal(agent.act(state, what, jax.random.key(0), explore=False), reference)
+
+
+def test_belief_loss_by_hand() -> None:
+    """Masked mean over B × Δ of the mean squared error, padded zeros counted."""
+    agent = dataclasses.replace(TINY["vdpo"], dropout=0.0)
+    state, windows = vdpo_parts(agent)
+    x = unseen(windows)
+    loss, _ = agent.belief_loss((state.encoder, state.decoder), x, jax.random.key(0))
+    states = agent.encode(state.encoder, x.obs, x.actions, None) @ state.decoder["w"] + state.decoder["b"]
+    errors = np.square(np.asarray(states) - np.asarray(x.states)).mean(-1) * np.asarray(x.mask)
+    np.testing.assert_allclose(loss, errors.sum() / x.mask.size, rtol=1e-5)
+
+
+@pytest.mark.parametrize("direction", ["reverse", "forward"])
+def test_clone_loss_by_hand(direction: str) -> None:
+    agent = dataclasses.replace(TINY["vdpo"], dropout=0.0, direction=direction)
+    state, windows = vdpo_parts(agent)
+    x = unseen(windows)
+    loss, _ = agent.clone_loss({"head": state.head}, state, x, jax.random.key(0))
+    delayed = agent.policy(state, x.obs, x.actions)
+    reference = agent.reference.policy(state.reference.actor, x.states)
+    p, q = (delayed, reference) if direction == "reverse" else (reference, delayed)
+    m, s, n, u = (np.asarray(v, np.float64) for v in (p.mean, np.exp(p.log_std), q.mean, np.exp(q.log_std)))
+    kl = (np.log(u / s) + (s**2 + (m - n) ** 2) / (2 * u**2) - 0.5).mean(-1) * np.asarray(x.mask)
+    np.testing.assert_allclose(loss, kl.mean(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("behaviour", ["lower-q", "delayed", "reference", "mixture"])
+def test_behaviour(behaviour: str, rng: np.random.Generator) -> None:
+    """Only `delayed` does without the true state; `lower-q` executes the sample that the critics think less of."""
+    agent = dataclasses.replace(TINY["vdpo"], behaviour=behaviour, dropout=0.0)
+    state, _ = vdpo_parts(agent)
+    assert agent.privileged == (behaviour != "delayed")
+    chosen = {b: [] for b in ("lower-q", "delayed", "reference", "mixture")}
+    for seed in range(20):
+        what = seen(3, 2, np.random.default_rng(seed), truth=True)
+        for b, actions in chosen.items():
+            other = dataclasses.replace(agent, behaviour=b)
+            actions.append(np.asarray(other.act(state, what, jax.random.key(seed), explore=True)))
+        q = [
+            float(agent_q.min())
+            for agent_q in (
+                networks_twin(state, what.truth, chosen["reference"][-1]),
+                networks_twin(state, what.truth, chosen["delayed"][-1]),
+            )
+        ]
+        lower = chosen["reference"][-1] if q[0] < q[1] else chosen["delayed"][-1]
+        np.testing.assert_array_equal(chosen["lower-q"][-1], lower)
+    took_reference = [np.array_equal(m, r) for m, r in zip(chosen["mixture"], chosen["reference"], strict=True)]
+    assert 3 < sum(took_reference) < 17
+
+
+def networks_twin(state, truth, action):
+    from delayrl.core.networks import twin
+
+    return twin(state.reference.critic, truth, jnp.asarray(action))
+
+
+def test_paper_preset() -> None:
+    """Every row of the paper's table of hyperparameters (appendix)."""
+    agent, schedule = AGENTS["vdpo"].presets["paper"]
+    reference = agent.reference
+    assert schedule.replay_capacity == 1_000_000
+    assert reference.batch_size == 256
+    assert schedule.steps == 1_000_000
+    assert reference.discount == 0.99
+    assert reference.actor_learning_rate == 3e-4
+    assert reference.critic_learning_rate == 1e-3
+    assert len(reference.hidden) + 1 == 3
+    assert reference.hidden == (256, 256)
+    assert reference.entropy_per_action == -1
+    assert reference.temperature_learning_rate == 1e-3
+    assert reference.actor_every == 2
+    assert (reference.update_every, reference.updates) == (1, 1)
+    assert reference.target_rate == 5e-3
+    assert agent.width == 256
+    assert agent.layers == 3
+    assert agent.dropout == 0.1
+    assert agent.learning_rate == 3e-4
+    assert agent.phases()[0][:2] == (1, 1)
+    assert (agent.clone_every, agent.clone_updates) == (1000, 1000)
+    state = jax.eval_shape(lambda key: agent.init(Spec(17, 6, 25), key), jax.random.key(0))
+    assert state.encoder["position"].shape == (25, 256)  # sequence length Δ
+    assert state.encoder["blocks"][0]["qkv"]["w"].shape == (256, 3 * 256)  # one head
+    assert (agent.behaviour, agent.direction, agent.representation) == ("lower-q", "reverse", "transformer")
