@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.report.aggregates import THRESHOLDS, Aggregate
 from delayrl.report.results import Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
-from delayrl.report.summary import Summary
+from delayrl.report.summary import THRESHOLDS, Aggregate, Summary
 
 STYLES = {
     "vdpo": ("#2b63b5", "#7aaeff", ""),
@@ -26,9 +25,7 @@ STYLES = {
     "random": ("#999999", "#777777", "1 3"),
 }
 """Colours on light and on dark ground, and dashes: told apart with any colour vision, and in black and white."""
-SPARE = tuple(
-    zip(("#5b4bb7", "#00796b", "#8d5524", "#546e7a"), ("#a99cff", "#4fc3b4", "#d39b6a", "#9fb6c1"), strict=True)
-)
+SPARE = (("#5b4bb7", "#a99cff"), ("#00796b", "#4fc3b4"), ("#8d5524", "#d39b6a"), ("#546e7a", "#9fb6c1"))
 Look = tuple[str, str, str, str]  # name, then a style
 SAC: Look = ("delay-free SAC", *STYLES["sac"])
 RANDOM: Look = ("random", *STYLES["random"])
@@ -93,12 +90,9 @@ def _task_panels(results: list[Result]) -> tuple[Any, dict[str, Any]]:
 def _save(figure: Any, path: Path) -> None:
     from matplotlib import pyplot
 
-    lines = {
-        label: line
-        for panel in figure.axes
-        for line, label in zip(*panel.get_legend_handles_labels(), strict=True)
-        if not label.startswith("_")
-    }
+    lines: dict[str, Any] = {}
+    for panel in figure.axes:
+        lines |= {label: line for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     names = sorted(lines, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
     handles = [lines[name] for name in names]
     figure.legend(handles, names, loc="outside lower center", ncols=5, frameon=False, fontsize=9)

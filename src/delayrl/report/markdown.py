@@ -7,11 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from delayrl.report import wording
-from delayrl.report.aggregates import Aggregate
 from delayrl.report.results import Result, Setting, agent_order
 from delayrl.report.statistics import mean_std
-from delayrl.report.summary import Summary
+from delayrl.report.summary import Aggregate, Summary
 from delayrl.report.tables import Table
+
+GREY = '<span style="color:#888">{}</span>'
 
 
 def markdown(
@@ -28,8 +29,7 @@ def markdown(
     ]
     if summary.unplaced:
         parts.append(f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out.")
-    parts += [_escape(line) for line in wording.overrides(summary)]
-    parts += [_escape(line) for line in wording.made_with(versions)]
+    parts += [_escape(line) for line in wording.overrides(summary) + wording.made_with(versions)]
     for setting in summary.settings:
         results = [r for r in summary.results.values() if r.place.setting == setting]
         protocol, preset = _escape(setting.protocol), _escape(setting.preset)
@@ -63,18 +63,15 @@ def _table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---" for _ in head], *body))
 
 
-def _grey(text: str) -> str:
-    return f'<span style="color:#888">{text}</span>'
-
-
 def _paper_table(summary: Summary, table: Table) -> str:
     body = []
     for env, delay in table.rows:
         line = [_escape(env), _escape(delay)]
         for column in table.columns:
             ours, raw, note, theirs = wording.entry_texts(table, table.entries[env, delay, column])
-            parts = [f"**{ours}**" if ours else "", f"raw {raw}" if raw else "", _escape(note)]
-            line.append("<br>".join(p for p in [*parts, _grey(f"paper {theirs}") if theirs else ""] if p))
+            grey = GREY.format(f"paper {theirs}") if theirs else ""
+            parts = (f"**{ours}**" if ours else "", f"raw {raw}" if raw else "", _escape(note), grey)
+            line.append("<br>".join(part for part in parts if part))
         body.append(line)
     return _table(["Task", "Δ", *(_escape(summary.name(column)) for column in table.columns)], body)
 
@@ -92,7 +89,7 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
                 continue
             interval = "" if math.isnan(a.low) else f"<br>{a.low:.2f} to {a.high:.2f}"
             tasks = wording.count(a.tasks, "condition" if delay is None else "task")
-            counts = _grey(f"{tasks}, {wording.count(a.runs, 'run')}")
+            counts = GREY.format(f"{tasks}, {wording.count(a.runs, 'run')}")
             line.append(f"**{a.iqm:.2f}**{interval}<br>{counts}")
         body.append(line)
     return _table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
@@ -109,17 +106,11 @@ def _anchors(results: Iterable[Result]) -> str:
 
 
 def _results(summary: Summary, results: Iterable[Result]) -> str:
-    body = [
-        (
-            _escape(r.place.env),
-            _escape(r.place.delay),
-            _escape(summary.name(r.place.label)),
-            wording.spread(*mean_std(r.curves.final)),
-            wording.spread(*mean_std(r.normalise(r.curves.final)), wording.normalised),
-            f"{r.runs}/{r.seeds}",
-            f"{r.condition.steps:,}",
-            r.unfinished or r.progress.state,
-        )
-        for r in results
-    ]
+    body = []
+    for r in results:
+        names = [_escape(text) for text in (r.place.env, r.place.delay, summary.name(r.place.label))]
+        raw = wording.spread(*mean_std(r.curves.final))
+        normalised = wording.spread(*mean_std(r.normalise(r.curves.final)), wording.normalised)
+        seeds, state = f"{r.runs}/{r.seeds}", r.unfinished or r.progress.state
+        body.append((*names, raw, normalised, seeds, f"{r.condition.steps:,}", state))
     return _table(("Task", "Δ", "Agent", "Return", "Normalised", "Seeds", "Steps", "State"), body)

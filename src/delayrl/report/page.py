@@ -12,14 +12,15 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 from delayrl.report import figures, wording
-from delayrl.report.aggregates import THRESHOLDS, Aggregate
-from delayrl.report.results import Anchor, Result, Setting, agent_order, delay_order
+from delayrl.report.results import Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
-from delayrl.report.summary import Summary
+from delayrl.report.summary import THRESHOLDS, Aggregate, Summary
 from delayrl.report.tables import Table
+
+Names = dict[str, list[Any]]  # the data holds indices into these lists
 
 
 def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> str:
@@ -34,30 +35,18 @@ def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = (
     return re.sub(r"\{\{(title|digest|data)\}\}", lambda match: values[match[1]], template)
 
 
-class _Names(NamedTuple):
-    """Lists into which the page's data holds indices; anchors by setting, task and steps."""
-
-    settings: list[Setting]
-    tasks: list[str]
-    delays: list[int | str]
-    agents: list[str]
-    anchors: list[tuple[Setting, str, int]]
-
-
 def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """Return what the page draws: plain lists, numbers and texts."""
     results = list(summary.results.values())
     anchored: dict[tuple[Setting, str, int], Result] = {}
     for result in results:
         anchored.setdefault(_anchor_key(result), result)
-    names = _Names(
-        summary.settings,
-        sorted({r.place.env for r in results}),
-        sorted({r.place.delay for r in results}, key=delay_order),
-        sorted({*summary.labels, *(c for t in summary.tables for c in t.columns)}, key=agent_order),
-        list(anchored),
-    )
-    styles = figures.styles(names.agents)
+    agents = sorted({*summary.labels, *(c for t in summary.tables for c in t.columns)}, key=agent_order)
+    delays = sorted({r.place.delay for r in results}, key=delay_order)
+    tasks, settings = sorted({r.place.env for r in results}), summary.settings
+    names: Names = {"settings": settings, "tasks": tasks, "delays": delays, "agents": agents, "anchors": [*anchored]}
+    seeds = {s: wording.seeds(r for r in results if r.place.setting == s) for s in settings}
+    styles = figures.styles(agents)
     notes = wording.overrides(summary) + wording.made_with(versions)
     if summary.unplaced:
         notes.append(f"{summary.unplaced:,} rows belong to no cell of the grid; left out.")
@@ -67,17 +56,10 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "counts": Counter(r.progress.state for r in results),
         "notes": notes,
         "paper": wording.PAPER.replace("`", ""),
-        "settings": [
-            {
-                "protocol": s.protocol,
-                "preset": s.preset,
-                "seeds": wording.seeds(r for r in results if r.place.setting == s),
-            }
-            for s in names.settings
-        ],
-        "tasks": names.tasks,
-        "delays": names.delays,
-        "agents": [{"label": label, "name": summary.name(label), "style": styles[label]} for label in names.agents],
+        "settings": [s._asdict() | {"seeds": seeds[s]} for s in settings],
+        "tasks": tasks,
+        "delays": delays,
+        "agents": [{"label": label, "name": summary.name(label), "style": styles[label]} for label in agents],
         "results": [_result(r, names) for r in results],
         "anchors": [_anchors(r, names) for r in anchored.values()],
         "tables": [_table(t, names) for t in summary.tables],
@@ -100,13 +82,13 @@ def _rounded(value: Any, digits: int = 12) -> Any:
     return [_rounded(x, digits) for x in value] if isinstance(value, list | tuple) else value
 
 
-def _result(r: Result, names: _Names) -> dict[str, Any]:
+def _result(r: Result, names: Names) -> dict[str, Any]:
     curves = r.curves
     return {
-        "setting": names.settings.index(r.place.setting),
-        "task": names.tasks.index(r.place.env),
-        "delay": names.delays.index(r.place.delay),
-        "agent": names.agents.index(r.place.label),
+        "setting": names["settings"].index(r.place.setting),
+        "task": names["tasks"].index(r.place.env),
+        "delay": names["delays"].index(r.place.delay),
+        "agent": names["agents"].index(r.place.label),
         "status": r.progress.state,
         "progress": r.unfinished or r.progress.state,
         "running": r.progress.state == "running",
@@ -118,7 +100,7 @@ def _result(r: Result, names: _Names) -> dict[str, Any]:
         "raw": _rounded(mean_std(curves.final)),
         "normalised": _rounded(mean_std(r.normalise(curves.final))),
         "reached": [_rounded(r.steps_to_threshold), r.seeds_at_threshold],
-        "anchor": names.anchors.index(_anchor_key(r)),
+        "anchor": names["anchors"].index(_anchor_key(r)),
         "steps": curves.steps.tolist(),
         "mean": _rounded(curves.mean, 5) if r.runs else [],
         "std": _rounded(curves.returns.std(0, ddof=1), 5) if r.runs > 1 else [],
@@ -130,41 +112,34 @@ def _anchor_key(r: Result) -> tuple[Setting, str, int]:
     return r.place.setting, r.place.env, r.condition.steps
 
 
-def _anchors(r: Result, names: _Names) -> dict[str, Any]:
-    return {
-        "setting": names.settings.index(r.place.setting),
-        "task": names.tasks.index(r.place.env),
-        "total": r.condition.steps,
-        "random": _anchor(r.random_anchor),
-        "reference": _anchor(r.reference_anchor),
-    }
+def _anchors(r: Result, names: Names) -> dict[str, Any]:
+    setting, task = names["settings"].index(r.place.setting), names["tasks"].index(r.place.env)
+    anchors = {"random": r.random_anchor, "reference": r.reference_anchor}
+    values = {n: {"value": _rounded(a.value), "runs": a.runs, "source": a.source} for n, a in anchors.items()}
+    return {"setting": setting, "task": task, "total": r.condition.steps, **values}
 
 
-def _anchor(anchor: Anchor) -> dict[str, Any]:
-    return {"value": _rounded(anchor.value), "runs": anchor.runs, "source": anchor.source}
-
-
-def _table(table: Table, names: _Names) -> dict[str, Any]:
+def _table(table: Table, names: Names) -> dict[str, Any]:
     rows = []
     for env, delay in table.rows:
         entries = [table.entries[env, delay, column] for column in table.columns]
         texts = [[_rounded(e.value), e.partial, *wording.entry_texts(table, e)] for e in entries]
-        rows.append([names.tasks.index(env), names.delays.index(delay), texts])
+        rows.append([names["tasks"].index(env), names["delays"].index(delay), texts])
     return {
         "kind": table.kind,
         "title": table.title,
         "source": wording.source(table),
-        "setting": names.settings.index(table.setting),
-        "columns": [names.agents.index(column) for column in table.columns],
+        "setting": names["settings"].index(table.setting),
+        "columns": [names["agents"].index(column) for column in table.columns],
         "rows": rows,
     }
 
 
-def _aggregate(a: Aggregate, names: _Names) -> dict[str, Any]:
+def _aggregate(a: Aggregate, names: Names) -> dict[str, Any]:
     return {
-        "setting": names.settings.index(a.setting),
-        "delay": None if a.delay is None else names.delays.index(a.delay),
-        "agent": names.agents.index(a.label),
+        "setting": names["settings"].index(a.setting),
+        "delay": None if a.delay is None else names["delays"].index(a.delay),
+        "agent": names["agents"].index(a.label),
         "iqm": _rounded([a.iqm, a.low, a.high]),
         "tasks": a.tasks,
         "runs": a.runs,

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.report import statistics
-from delayrl.report.cells import Standing
 from delayrl.report.rows import RowGroup
 from delayrl.report.statistics import NAN, Floats
 from delayrl.run.cell import Cell, Progress, State
 from delayrl.run.condition import Condition
 
+Standing = Sequence[tuple[Cell, Progress]]
 PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
 """Columns of the paper's tables."""
 
@@ -69,30 +69,18 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """All seeds of one condition.
+    """All seeds of one condition."""
 
-    Attributes:
-        place: row and column; the label is the agent, with what tells it from the agent's other cells.
-        condition: what was trained; its steps are those at which training ends.
-        progress: of several cells the worst state, and the least step of the cells in that state.
-        seeds: how many are to be run.
-        partial: no seed has reached its last step, so that the numbers are those of the steps so far.
-        privileged: whether its behaviour reads the true state while it trains.
-        curves: of the complete seeds; where there is none yet, of all.
-        reference: the same of its delay-free reference, where it has one.
-        random_anchor, reference_anchor: what its returns are normalised by.
-    """
-
-    place: Place
-    condition: Condition
-    progress: Progress
-    seeds: int
-    partial: bool
-    privileged: bool
-    curves: Curves
-    reference: Curves
-    random_anchor: Anchor = NO_ANCHOR
-    reference_anchor: Anchor = NO_ANCHOR
+    place: Place  # the label is the agent, with what tells it from the agent's other cells
+    condition: Condition  # its steps are those at which training ends
+    progress: Progress  # of several cells the worst state, and the least step of the cells in that state
+    seeds: int  # how many are to be run
+    partial: bool  # no seed has reached its last step, so that the numbers are those of the steps so far
+    privileged: bool  # whether its behaviour reads the true state while it trains
+    curves: Curves  # of the complete seeds; where there is none yet, of all
+    reference: Curves  # the same of its delay-free reference, where it has one
+    random_anchor: Anchor = NO_ANCHOR  # its returns are normalised by this
+    reference_anchor: Anchor = NO_ANCHOR  # and by this
 
     @property
     def runs(self) -> int:
@@ -121,10 +109,9 @@ class Result:
     @property
     def steps_to_threshold(self) -> float:
         """The step at which the mean over the seeds first reaches Ret_df; NaN if it does not, or without Ret_df."""
-        threshold = self.reference_anchor.value
-        return (
-            float(statistics.steps_to_threshold(self.curves.steps, self.curves.mean, threshold)) if self.runs else NAN
-        )
+        if not self.runs:
+            return NAN
+        return float(statistics.steps_to_threshold(self.curves.steps, self.curves.mean, self.reference_anchor.value))
 
     @property
     def seeds_at_threshold(self) -> int:
@@ -145,15 +132,9 @@ def delay_order(delay: int | str) -> tuple[bool, int, str]:
 
 
 def make_results(
-    standing: Standing, groups_of: Mapping[str, Sequence[RowGroup]], labels: Mapping[str, str]
+    standing: Standing, group_of: Mapping[str, RowGroup], labels: Mapping[str, str]
 ) -> dict[Place, Result]:
-    """Make a result with its anchors of all cells that differ in nothing but their seeds.
-
-    Args:
-        standing: the cells and how far they are.
-        groups_of: rows of each cell, by its id.
-        labels: label of each cell, by its id.
-    """
+    """Make a result with its anchors of all cells that differ in nothing but their seeds."""
     members: dict[Place, list[tuple[Cell, Progress]]] = defaultdict(list)
     for cell, progress in sorted(standing, key=lambda item: item[0].id):
         condition = cell.condition
@@ -162,10 +143,7 @@ def make_results(
         if any(set(other.seeds) & set(cell.seeds) for other, _ in members[place]):  # the same seeds again
             place = place._replace(label=f"{place.label} #{cell.id[:8]}")
         members[place].append((cell, progress))
-    results = [
-        _result(place, group, [rows for cell, _ in group for rows in groups_of[cell.id]])
-        for place, group in members.items()
-    ]
+    results = [_result(place, cells, group_of) for place, cells in members.items()]
     return {result.place: _anchored(result, results) for result in sorted(results, key=_order)}
 
 
@@ -174,8 +152,9 @@ def _order(result: Result) -> tuple[Any, ...]:
     return place.setting, place.env, delay_order(place.delay), agent_order(place.label)
 
 
-def _result(place: Place, standing: Standing, groups: Sequence[RowGroup]) -> Result:
+def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup]) -> Result:
     """Complete seeds count; until there is one, all of them count as partial."""
+    groups = [group_of[cell.id] for cell, _ in standing if cell.id in group_of]
     runs = {seed: run for group in groups for seed, run in group.runs("agent").items()}
     steps = max(cell.condition.steps for cell, _ in standing) or max((max(run) for run in runs.values()), default=0)
     complete = {seed for seed, run in runs.items() if max(run) >= steps}

@@ -27,18 +27,11 @@ class Evaluation:
 
 @dataclass
 class RowGroup:
-    """The rows that name the same cell and the same condition.
+    """The rows that name the same cell and the same condition."""
 
-    Attributes:
-        cell: the id of the cell; None if the rows name no cell.
-        condition: what the rows say of it; they do not name overrides and steps.
-        privileged: whether the agent's behaviour reads the true state while it trains.
-        curves: evaluations by (policy, seed), then by step.
-    """
-
-    cell: str | None
-    condition: Condition
-    privileged: bool
+    cell: str | None  # its id; None if the rows name no cell
+    condition: Condition  # without overrides and steps, which rows do not name
+    privileged: bool  # whether the agent's behaviour reads the true state while it trains
     curves: dict[tuple[str, int], dict[int, Evaluation]] = field(
         default_factory=lambda: defaultdict(lambda: defaultdict(Evaluation))
     )
@@ -58,11 +51,7 @@ class RowGroup:
 
 
 def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
-    """Check rows and sum them up, in one pass.
-
-    Raises:
-        DelayRLError: a row lacks a column, holds a value of another type, or is there twice.
-    """
+    """Check rows and sum them up, in one pass. Raises DelayRLError if one lacks a column, is damaged or there twice."""
     groups: dict[tuple[Any, ...], RowGroup] = {}
     columns = itemgetter(*CONDITION_COLUMNS, "seed", "step", "policy", "episode", "return")
     for number, row in enumerate(rows, 1):

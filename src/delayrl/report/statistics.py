@@ -46,10 +46,9 @@ def stratified_bootstrap(
     strata: Sequence[ArrayLike],
     statistic: Callable[[Floats], Floats],
     repetitions: int = 2000,
-    level: float = 0.95,
     seed: int = 0,
 ) -> tuple[Floats, Floats]:
-    """Estimate the percentile interval of a statistic of pooled scores.
+    """Estimate the 95 % percentile interval of a statistic of pooled scores.
 
     Runs are drawn with replacement within their stratum.
 
@@ -57,8 +56,7 @@ def stratified_bootstrap(
         strata: scores of each task, at least one in each.
         statistic: of scores [repetitions, runs], along the last axis; returns [repetitions, ...].
         repetitions: how many times.
-        level: of the interval.
-        seed: of the draws: the same scores give the same interval.
+        seed: the same scores and seed give the same interval.
 
     Returns:
         Lower and upper bound; NaN where a stratum has fewer than two runs, because their spread is then unknown.
@@ -67,28 +65,22 @@ def stratified_bootstrap(
     random = np.random.default_rng(seed)
     drawn = [x[random.integers(x.size, size=(repetitions, x.size))] for x in arrays]
     values = statistic(np.concatenate(drawn, axis=-1))
-    tail = 50 * (1 - level)
+    tail = 50 * (1 - 0.95)
     low, high = np.percentile(values, [tail, 100 - tail], axis=0)
-    if min(x.size for x in arrays) < 2:
-        low, high = np.full_like(low, NAN), np.full_like(high, NAN)
-    return low, high
+    known = min(x.size for x in arrays) > 1
+    return (low, high) if known else (np.full_like(low, NAN), np.full_like(high, NAN))
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
     """Return the fraction of the scores, [..., runs], above each threshold, [T], as [..., T]."""
     x, thresholds = np.sort(np.asarray(scores, float), axis=-1), np.asarray(thresholds, float)
-    if not x.shape[-1]:
-        return np.full((*x.shape[:-1], thresholds.size), NAN)
     flat = x.reshape(-1, x.shape[-1])
     above = np.stack([x.shape[-1] - np.searchsorted(row, thresholds, side="right") for row in flat])
     return (above / x.shape[-1]).reshape(*x.shape[:-1], thresholds.size)
 
 
 def common_steps(runs: Sequence[Mapping[int, float]]) -> tuple[NDArray[np.int64], Floats]:
-    """Align runs on the steps that all of them have, so that every mean is over the same runs.
-
-    Args:
-        runs: returns by step.
+    """Align runs, returns by step, on the steps that all of them have, so that every mean is over the same runs.
 
     Returns:
         Steps [N], in order, and returns [runs, N].

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from itertools import product
 from typing import Literal, NamedTuple
 
 from delayrl.report import statistics
@@ -38,24 +39,15 @@ def published_values() -> dict[tuple[str, ...], PublishedValue]:
 
 
 class TableEntry(NamedTuple):
-    """What stands in a row and a column. Numbers are NaN where there are none.
+    """What stands in a row and a column. Numbers are NaN where there are none."""
 
-    Attributes:
-        value, std: a normalised return, or a number of steps.
-        raw, raw_std: the raw return beside it.
-        missed: training has ended and the threshold was not reached.
-        partial: no seed has reached its last step.
-        note: what else must be known of the value.
-        published: the paper's value.
-    """
-
-    value: float = NAN
+    value: float = NAN  # a normalised return, or a number of steps
     std: float = NAN
-    raw: float = NAN
+    raw: float = NAN  # the raw return beside it
     raw_std: float = NAN
-    missed: bool = False
-    partial: bool = False
-    note: str = ""
+    missed: bool = False  # training has ended and the threshold was not reached
+    partial: bool = False  # no seed has reached its last step
+    note: str = ""  # what else must be known of the value
     published: PublishedValue | None = None
 
 
@@ -104,22 +96,14 @@ def _table(
     if kind != "ablation" and any((env.removeprefix("delayrl/"), str(delay)) in in_paper for env, delay in rows):
         agents = {column.split(" ")[0] for column in columns}
         columns |= {agent for agent in PAPER_ORDER if agent not in agents}
-    keys = {place.label: _key(result) for place, result in results.items()}
-    entries = {
-        (env, delay, label): _entry(
-            kind,
-            results.get(Place(setting, env, delay, label)),
-            _published(kind, env, delay, *keys.get(label, (label, "transformer"))),
-        )
-        for env, delay in rows
-        for label in columns
-    }
+    conditions = {place.label: result.condition for place, result in results.items()}
+    entries = {}
+    for (env, delay), label in product(rows, columns):
+        overrides = conditions[label].overrides if label in conditions else {}
+        agent = conditions[label].agent if label in conditions else label
+        published = _published(kind, env, delay, agent, str(overrides.get("representation", "transformer")))
+        entries[env, delay, label] = _entry(kind, results.get(Place(setting, env, delay, label)), published)
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
-
-
-def _key(result: Result) -> tuple[str, str]:
-    """The agent and its representation, by which the paper's values are found."""
-    return result.condition.agent, str(result.condition.overrides.get("representation", "transformer"))
 
 
 def _published(kind: Kind, env: str, delay: int | str, agent: str, representation: str) -> PublishedValue | None:
@@ -137,8 +121,8 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) 
     missed = False
     if kind == "steps":
         value, std = result.steps_to_threshold, NAN
-        if not math.isnan(result.reference_anchor.value) and result.runs:
-            missed = math.isnan(value) and not result.partial
+        ended = result.runs > 0 and not result.partial and not math.isnan(result.reference_anchor.value)
+        missed = ended and math.isnan(value)
         if result.seeds_at_threshold:
             notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds")
     else:
