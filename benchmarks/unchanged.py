@@ -101,7 +101,7 @@ def record(folder: Path) -> None:
         runs = {name: pool.submit(train, folder / "runs" / name, name) for name in RUNS}
         others: dict[str, Any] = {"wrappers": pool.submit(shown)}
         for grid in GRIDS:
-            others[f"plan {grid}"] = pool.submit(delayrl, "bench", "plan", grid, "--runs", str(folder / "none"))
+            others[f"cells of {grid}"] = pool.submit(cells, grid, folder / "none")
         for table in TABLES:
             others[table] = pool.submit(report, folder, table)
         for name, run in (runs | others).items():
@@ -247,6 +247,12 @@ def shown() -> dict[str, str]:
         seen += [vector.step(vector.action_space.sample()) for _ in range(220)]
         facts[f"vector {text}"] = digest(repr(seen).encode())
     return facts
+
+
+def cells(grid: str, runs: Path) -> list[str]:
+    """The cells of a grid that comes with the package, with their ids."""
+    plan = delayrl("bench", "plan", grid, "--runs", str(runs))
+    return plan.split("\n\n")[0].splitlines()
 
 
 def report(folder: Path, table: str) -> dict[str, str]:
