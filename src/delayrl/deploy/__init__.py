@@ -7,30 +7,19 @@ safetensors, `Controller` NumPy alone.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from delayrl.deploy.runtime.controller import Controller as Controller
+from delayrl.deploy.runtime.controller import ControlPolicy as ControlPolicy
+from delayrl.deploy.runtime.controller import OverrunError as OverrunError
+from delayrl.deploy.runtime.history import ClockError as ClockError
+from delayrl.deploy.runtime.telemetry import Statistics as Statistics
+
 if TYPE_CHECKING:
     from delayrl.deploy.bundle import Bundle as Bundle
     from delayrl.deploy.bundle import load_bundle as load_bundle
     from delayrl.deploy.export import export_run as export_run
-    from delayrl.deploy.runtime.clock import ClockError as ClockError
-    from delayrl.deploy.runtime.controller import Controller as Controller
-    from delayrl.deploy.runtime.controller import ControlPolicy as ControlPolicy
-    from delayrl.deploy.runtime.controller import OverrunError as OverrunError
-    from delayrl.deploy.runtime.telemetry import Statistics as Statistics
-
-_MODULES = {
-    "Bundle": "bundle",
-    "ClockError": "runtime.clock",
-    "ControlPolicy": "runtime.controller",
-    "Controller": "runtime.controller",
-    "OverrunError": "runtime.controller",
-    "Statistics": "runtime.telemetry",
-    "export_run": "export",
-    "load_bundle": "bundle",
-}
-__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return getattr(import_module(f"delayrl.deploy.{_MODULES[name]}"), name)
+    if module := {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"}.get(name):
+        return getattr(import_module(f"delayrl.deploy.{module}"), name)
     raise AttributeError(f"module 'delayrl.deploy' has no attribute {name!r}")

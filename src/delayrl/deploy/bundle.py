@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from delayrl.deploy.backends.network import Act, Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
-from delayrl.deploy.runtime.clock import LONGEST_STEP, SHORTEST_STEP
+from delayrl.deploy.runtime.history import LONGEST_STEP, SHORTEST_STEP
 from delayrl.errors import DelayRLError
 
 BACKENDS = ("numpy", "onnx", "jax")
@@ -66,9 +66,9 @@ class Bundle:
             raise DelayRLError("the policy takes arrays of numbers: obs [S] and actions [Δ, A]") from None
         if obs.shape != (self.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.obs_size}; got shape {obs.shape}")
-        if actions.shape != (self.max_age, self.action_size):
-            expected = (self.max_age, self.action_size)
-            raise DelayRLError(f"the policy takes an action history of shape {expected}; got {actions.shape}")
+        shape = (self.max_age, self.action_size)
+        if actions.shape != shape:
+            raise DelayRLError(f"the policy takes an action history of shape {shape}; got {actions.shape}")
         if not 0 <= age <= self.max_age:
             raise DelayRLError(f"the policy was trained for ages 0..{self.max_age}; got {age}")
         if not (np.isfinite(obs).all() and np.isfinite(actions[:age]).all()):
@@ -94,18 +94,18 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
         raise DelayRLError(f"unknown backend {backend!r}; there are {', '.join(BACKENDS)}")
     metadata, files = read_files(path, (WEIGHTS, GRAPH) if backend == "onnx" else (WEIGHTS,))
     network, arrays = check_files(path, metadata, files)
-    reference = numpy_policy(network, arrays)
-    if backend == "numpy":
-        return Bundle(network, metadata, reference, backend)
+    act = numpy_policy(network, arrays)
     if backend == "jax":
         from delayrl.deploy.backends.jax_policy import jax_policy
 
-        return Bundle(network, metadata, jax_policy(network, arrays), backend)
-    from delayrl.deploy.backends.onnx_policy import onnx_policy
+        act = jax_policy(network, arrays)
+    if backend == "onnx":
+        from delayrl.deploy.backends.onnx_policy import onnx_policy
 
-    if GRAPH not in files:
-        raise DelayRLError(f"{path} holds no {GRAPH}")
-    try:
-        return Bundle(network, metadata, onnx_policy(network, files[GRAPH], reference), backend)
-    except DelayRLError as error:
-        raise DelayRLError(f"{Path(path) / GRAPH} cannot be used: {error}") from error
+        if GRAPH not in files:
+            raise DelayRLError(f"{path} holds no {GRAPH}")
+        try:
+            act = onnx_policy(network, files[GRAPH], act)
+        except DelayRLError as error:
+            raise DelayRLError(f"{Path(path) / GRAPH} cannot be used: {error}") from error
+    return Bundle(network, metadata, act, backend)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import safetensors.numpy
-from gymnasium.spaces import Box
 
 from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.backends.onnx_graph import onnx_graph
@@ -20,15 +19,12 @@ from delayrl.wrappers.single import seconds_of
 
 
 def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict[str, Any]:
-    """Write the policy in the newest good checkpoint of a run as a bundle.
+    """Write the policy in the newest good checkpoint of a run folder as a bundle; return its metadata.
 
     Args:
         run: the run folder.
         out: a new or empty folder.
         force: replace a bundle in `out`.
-
-    Returns:
-        The content of bundle.json, without the checksums.
 
     Raises:
         DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
@@ -72,17 +68,9 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     if parts.encoder is not None:
         kind, tree["encoder"] = "transformer", parts.encoder
         sizes = {"width": parts.encoder["position"].shape[1], "blocks": len(parts.encoder["blocks"])}
-    network = Network(
-        spec.obs_size,
-        size,
-        spec.delay,
-        tuple(policy.low.tolist()),
-        tuple(policy.high.tolist()),
-        kind,
-        hidden(parts.head),
-        None if parts.current is None else hidden(parts.current),
-        **sizes,
-    )
+    low, high = tuple(policy.low.tolist()), tuple(policy.high.tolist())
+    current = None if parts.current is None else hidden(parts.current)
+    network = Network(spec.obs_size, size, spec.delay, low, high, kind, hidden(parts.head), current, **sizes)
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in flatten_tree(tree).items()}
     network.check(arrays)
     return network, arrays
@@ -92,9 +80,6 @@ def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
     config = run.config
     env = make(config["env"], config["delay"])
-    observations, actions = env.observation_space, env.action_space
-    assert isinstance(observations, Box)
-    assert isinstance(actions, Box)
     env.close()
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
@@ -102,8 +87,8 @@ def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
         "ages": [0, longest],
         "action_delay": env.delay.action.maximum,
         "dt": seconds_of(env),
-        "observation": _space(observations),
-        "action": _space(actions),
+        "observation": _space(env.observation_space),
+        "action": _space(env.action_space),
         "normalisation": {
             "observation": "none: the task's own numbers",
             "action": "inside, low .. high is -1 .. 1; the bundle takes and gives the task's own units",
@@ -115,7 +100,7 @@ def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
     }
 
 
-def _space(space: Box) -> dict[str, Any]:
+def _space(space: Any) -> dict[str, Any]:
     """Return a Box as JSON can hold it, with null for a missing bound."""
     low, high = ([float(x) if np.isfinite(x) else None for x in bound] for bound in (space.low, space.high))
     return {"shape": list(space.shape), "dtype": str(space.dtype), "low": low, "high": high}
@@ -129,10 +114,5 @@ def _evaluation(run: Run, step: int) -> dict[str, Any] | None:
         return None
     last = max(row["step"] for row in rows)
     returns = [row["return"] for row in rows if row["step"] == last]
-    return {
-        "step": last,
-        "episodes": len(returns),
-        "mean_return": float(np.mean(returns)),
-        "std_return": float(np.std(returns)),
-        "protocol": run.config.get("protocol"),
-    }
+    moments = {"mean_return": float(np.mean(returns)), "std_return": float(np.std(returns))}
+    return {"step": last, "episodes": len(returns), **moments, "protocol": run.config.get("protocol")}

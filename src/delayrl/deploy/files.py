@@ -10,12 +10,12 @@ A bundle may come from anybody. Only these names are read, and only as regular f
 and checksum are verified and every array has the shape that the description demands.
 """
 
-import hashlib
 import json
 import os
 import stat
 import tempfile
 from collections.abc import Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +53,9 @@ def read_files(path: str | Path, wanted: tuple[str, ...]) -> tuple[dict[str, Any
             raise DelayRLError(f"{home / DOCUMENT} names a file that no bundle has: {name[:80]!r}")
     contents = {DOCUMENT: document}
     for name in (name for name in wanted if name in files):
-        entry = files[name]
-        data = _read(home / name)
-        if not isinstance(entry, dict) or (len(data), _digest(data)) != (entry.get("bytes"), entry.get("sha256")):
+        entry, data = files[name], _read(home / name)
+        actual = len(data), sha256(data).hexdigest()
+        if not isinstance(entry, dict) or actual != (entry.get("bytes"), entry.get("sha256")):
             raise DelayRLError(f"{home / name} is cut or changed: it is not the file that {DOCUMENT} describes")
         contents[name] = data
     return metadata, contents
@@ -78,7 +78,7 @@ def check_files(path: str | Path, metadata: dict[str, Any], files: Mapping[str, 
 def seal(metadata: Mapping[str, Any], files: Mapping[str, bytes]) -> dict[str, bytes]:
     """Return the files with a bundle.json added: the metadata, their sizes and checksums, and its own checksum."""
     document = {"format": FORMAT, **metadata}
-    document["files"] = {name: {"bytes": len(data), "sha256": _digest(data)} for name, data in files.items()}
+    document["files"] = {name: {"bytes": len(data), "sha256": sha256(data).hexdigest()} for name, data in files.items()}
     document["checksum"] = checksum(document)
     return {DOCUMENT: json.dumps(document, indent=1, allow_nan=False).encode() + b"\n", **files}
 
@@ -86,17 +86,15 @@ def seal(metadata: Mapping[str, Any], files: Mapping[str, bytes]) -> dict[str, b
 def checksum(document: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a bundle.json without its checksum. It covers the other files through theirs."""
     rest = {name: value for name, value in document.items() if name != "checksum"}
-    return _digest(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode())
+    return sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def check_target(out: Path, *, force: bool = False) -> None:
     """Raise DelayRLError unless `out` is new, an empty folder, or (with `force`) a folder with a bundle."""
     with disk_errors(out):
-        if not (out.exists() or out.is_symlink()):
-            return
-        if not out.is_dir():
+        if not out.is_dir() and (out.exists() or out.is_symlink()):
             raise DelayRLError(f"{out} exists and is not a folder; give another --out")
-        if not any(out.iterdir()):
+        if not out.is_dir() or not any(out.iterdir()):
             return
         if not force:
             raise DelayRLError(f"{out} is not empty; give another --out, or --force to replace a bundle in it")
@@ -192,7 +190,3 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
         return safetensors.numpy.load(data)
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError, OverflowError, MemoryError) as error:
         raise DelayRLError(f"it is not a safetensors file that we write ({str(error)[:80]!r})") from error
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()

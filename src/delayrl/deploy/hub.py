@@ -14,15 +14,12 @@ CARD = "README.md"
 
 
 def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
-    """Upload a bundle and a model card made from its metadata, as one commit. Creates the repository if needed.
+    """Upload a bundle and a model card made from its metadata, as one commit; return the address of the repository.
 
     Args:
         bundle: the folder of the bundle, which is checked first.
-        repo: OWNER/NAME.
+        repo: OWNER/NAME; it is created if needed.
         private: whether a new repository is private.
-
-    Returns:
-        The address of the repository.
 
     Raises:
         DelayRLError: a broken bundle, no access, or no network.
@@ -39,16 +36,13 @@ def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
 
 
 def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool = False) -> dict[str, Any]:
-    """Download a bundle and check it, then move it into a new or empty folder. No other file is requested.
+    """Download a bundle and check it, then move it into a folder; return the content of its bundle.json.
 
     Args:
-        repo: OWNER/NAME.
-        out: the folder.
+        repo: OWNER/NAME. No other file of it is requested.
+        out: a new or empty folder.
         revision: a branch, tag or commit; None for the default branch.
         force: replace a bundle in `out`.
-
-    Returns:
-        The content of bundle.json.
 
     Raises:
         DelayRLError: no such repository, no bundle in it or a broken one, or a folder that holds something else.
@@ -84,40 +78,23 @@ def card(metadata: Mapping[str, Any], repo: str) -> str:
     head: dict[str, Any] = {"library_name": "delayrl", "pipeline_tag": "reinforcement-learning"}
     head["tags"] = ["reinforcement-learning", "delay", "delayrl", agent, env]
     lines = [f"# {agent} on {env}, delay {delay}", ""]
-    lines += [
+    lines.append(
         "A policy for observations that arrive late: it takes the newest observation that has arrived, its age in "
-        "steps, and the actions applied since.",
-        "",
-        "| | |",
-        "| --- | --- |",
-        f"| observation | {policy['obs_size']} numbers |",
-        f"| action | {policy['action_size']} numbers |",
-        f"| ages | 0 .. {policy['max_age']} |",
-    ]
+        "steps, and the actions applied since."
+    )
+    lines += ["", "| | |", "| --- | --- |", f"| observation | {policy['obs_size']} numbers |"]
+    lines += [f"| action | {policy['action_size']} numbers |", f"| ages | 0 .. {policy['max_age']} |"]
     lines += [f"| {name} | {plain(metadata.get(name))} |" for name in ("dt", "preset", "protocol", "seed", "step")]
     if isinstance(evaluation, Mapping):
-        mean, spread, count, step = (
-            plain(evaluation.get(name)) for name in ("mean_return", "std_return", "episodes", "step")
-        )
+        names = ("mean_return", "std_return", "episodes", "step")
+        mean, spread, count, step = (plain(evaluation.get(name)) for name in names)
         lines += [f"| return | {mean} ± {spread} (standard deviation of {count} episodes, at step {step}) |"]
-    lines += [
-        f"| checksum | {plain(metadata['checksum'])} |",
-        "",
-        "The return is raw, of the last evaluation of one training run under its protocol.",
-        "",
-        "```",
-        "pip install 'delayrl[hub]'",
-        f"delayrl pull {repo} --out bundle",
-        "```",
-        "",
-        "```python",
-        "from delayrl.deploy import load_bundle",
-        "",
-        'policy = load_bundle("bundle")  # weights and JSON; nothing in it is code',
-        "action = policy(obs, actions, age)",
-        "```",
-        "",
-    ]
+    lines += [f"| checksum | {plain(metadata['checksum'])} |", ""]
+    lines += ["The return is raw, of the last evaluation of one training run under its protocol.", ""]
+    lines += ["```", "pip install 'delayrl[hub]'", f"delayrl pull {repo} --out bundle", "```", ""]
+    lines += ["```python", "from delayrl.deploy import load_bundle", ""]
+    lines += ['policy = load_bundle("bundle")  # weights and JSON; nothing in it is code']
+    lines += ["action = policy(obs, actions, age)", "```", ""]
     yaml = [f"{name}: {json.dumps(value)}" for name, value in head.items()]  # JSON is YAML
     return "\n".join(["---", *yaml, "---", "", *lines])
 

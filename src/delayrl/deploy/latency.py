@@ -92,12 +92,11 @@ def table(rows: dict[str, list[dict[str, Any]]], period: float | None) -> tuple[
     """Return the head and cells of a table, from the rows of each backend and the control period in milliseconds."""
     head = ["backend", "age", "p50 ms", "p99 ms", "max ms", "p99 of processor time"]
     head += ["p99 of the period"] if period else []
-    cells = [
-        [backend, str(row["age"]), *(f"{row[name]:.3f}" for name in ("p50", "p99", "max", "processor_p99"))]
-        + ([f"{row['p99'] / period:.1%}"] if period else [])
-        for backend in BACKENDS
-        for row in rows.get(backend, [])
-    ]
+    cells = []
+    for backend in BACKENDS:
+        for row in rows.get(backend, []):
+            times = [f"{row[name]:.3f}" for name in ("p50", "p99", "max", "processor_p99")]
+            cells.append([backend, str(row["age"]), *times] + ([f"{row['p99'] / period:.1%}"] if period else []))
     return head, cells
 
 

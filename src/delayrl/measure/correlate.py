@@ -69,29 +69,30 @@ def innovations(commands: Array, observations: Array, episode: Array) -> tuple[A
     return _standard(new_u, commanded) * (len(u) / max(int(commanded.sum()), 1)) ** 0.5, _standard(new_y, has_past)
 
 
-def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, Array]:
+def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, int]:
     """Sum the products of lagged u and y in `count` consecutive blocks of rows.
 
     Returns:
         Sums [count, lags, U, Y], for the lags 1..longest followed by far lags, as many as the log allows; and the
-        number of rows of each block, [count].
+        number of rows of a block.
     """
     size = len(u) // count
     rows = size * count
-    lags = [*range(1, longest + 1), *_far(longest, rows)]
+    far = range(2 * longest + 1, max(2 * longest + 2, min(rows // 2, 2 * longest + max(200, 2 * longest))))
+    lags = [*range(1, longest + 1), *far]
     sums = np.empty((count, len(lags), u.shape[1], y.shape[1]))
     target = y[:rows].reshape(count, size, -1)
     for i, lag in enumerate(lags):
         lagged = np.zeros((rows, u.shape[1]))
         lagged[lag:] = u[: rows - lag]
         sums[:, i] = lagged.reshape(count, size, -1).transpose(0, 2, 1) @ target
-    return sums, np.full(count, float(size))
+    return sums, size
 
 
-def correlation(sums: Array, rows: Array, longest: int, weights: Array | None = None) -> Correlation:
-    """Combine blocks into correlations; each block counts `weights` times, [count]."""
+def correlation(sums: Array, size: int, longest: int, weights: Array | None = None) -> Correlation:
+    """Combine blocks of `size` rows into correlations; each block counts `weights` times, [count]."""
     weights = np.ones(len(sums)) if weights is None else weights
-    total = float(weights @ rows)
+    total = float(weights.sum() * size)
     r = np.tensordot(weights, sums, 1) / total
     return Correlation(r[:longest], r[longest:], total)
 
@@ -120,11 +121,11 @@ def onset(c: Correlation) -> int | None:
     return int(lags[0]) if lags.size else None
 
 
-def resampled(sums: Array, rows: Array, longest: int, times: int, random: np.random.Generator) -> Iterator[Correlation]:
+def resampled(sums: Array, size: int, longest: int, times: int, random: np.random.Generator) -> Iterator[Correlation]:
     """Yield the correlations of a block bootstrap: over blocks drawn with replacement."""
     for _ in range(times):
         weights = np.bincount(random.integers(0, len(sums), len(sums)), minlength=len(sums)).astype(float)
-        yield correlation(sums, rows, longest, weights)
+        yield correlation(sums, size, longest, weights)
 
 
 def peak(r: Array) -> tuple[float, float]:
@@ -138,17 +139,12 @@ def peak(r: Array) -> tuple[float, float]:
     return i + 1 + float(shift), float(r[i])
 
 
-def _far(longest: int, rows: int) -> range:
-    return range(2 * longest + 1, max(2 * longest + 2, min(rows // 2, 2 * longest + max(200, 2 * longest))))
-
-
 def _tail(null: Array, chance: float) -> float:
     """Return what a sum of squares exceeds with this probability, for a scaled χ² with the null's mean and variance."""
     mean, variance = float(null.mean()), max(float(null.var()), 1e-12)
     freedom = 2 * mean**2 / variance
-    # the cube-root approximation of Wilson and Hilferty
     z, c = NormalDist().inv_cdf(1 - chance), 2 / (9 * freedom)
-    return mean * (1 - c + z * c**0.5) ** 3
+    return mean * (1 - c + z * c**0.5) ** 3  # the cube-root approximation of Wilson and Hilferty
 
 
 def _past(values: Array, order: int) -> Array:

@@ -35,47 +35,30 @@ class Pair:
 class Estimated:
     """A delay in seconds, and in steps of a control period.
 
-    Attributes:
-        method: "stamps" (exact, for each observation) or "correlation" (an estimate).
-        path: of the log.
-        delay: correlation: the dead time, from a command to the first row that reacts. stamps: the median.
-        low, high: correlation: the 95 % interval of a block bootstrap, widened by a row on each side. stamps: the 2.5th
-            and 97.5th percentiles.
-        row: spacing of the rows in seconds, which is the resolution of a correlation.
-        period: of control, in seconds.
-        rows: how many were used.
-        warm_up: seconds left out at the start.
-        steps: the delay of each window or observation, in steps, in order of time.
-        step: `delay` in steps.
-        strength: of the strongest lag, as a multiple of what chance gives in one of a thousand logs.
-        peak: pair with the largest correlation of increments. Its lag includes the plant's own lag.
-        pairs: the strongest pairs.
-        windows: (middle in seconds, dead time) of each part of the log that shows a dead time on its own.
-        longest: the largest delay of a window or an observation, in seconds.
-        slowest_warm_up: stamps only: the largest delay during the warm-up, in seconds.
-        drift: stamps only: growth of the smallest delays in parts per million, which shows clocks that run apart.
-        curve: (dead time, strength, r of the best pair's increments) of every lag.
+    By correlation, `delay` is the dead time, from a command to the first row that reacts; `low` and `high` are the 95 %
+    interval of a block bootstrap, widened by a row on each side. By stamps, they are the median, and the 2.5th and
+    97.5th percentiles.
     """
 
-    method: str
-    path: str
+    method: str  # "stamps" (exact, for each observation) or "correlation" (an estimate)
+    path: str  # of the log
     delay: float
     low: float
     high: float
-    row: float
-    period: float
-    rows: int
-    warm_up: float
-    steps: tuple[int, ...]
-    step: int
-    strength: float | None = None
-    peak: Pair | None = None
-    pairs: tuple[Pair, ...] = ()
-    windows: tuple[tuple[float, float], ...] = ()
-    longest: float = 0.0
-    slowest_warm_up: float | None = None
-    drift: float | None = None
-    curve: tuple[tuple[float, float, float], ...] = ()
+    row: float  # spacing of the rows in seconds, which is the resolution of a correlation
+    period: float  # of control, in seconds
+    rows: int  # how many were used
+    warm_up: float  # seconds left out at the start
+    steps: tuple[int, ...]  # the delay of each window or observation, in steps, in order of time
+    step: int  # `delay` in steps
+    strength: float | None = None  # of the strongest lag; chance reaches 1 in one of a thousand logs
+    peak: Pair | None = None  # largest correlation of increments; its lag includes the plant's own lag
+    pairs: tuple[Pair, ...] = ()  # the strongest pairs
+    windows: tuple[tuple[float, float], ...] = ()  # (middle in seconds, dead time) of each part that shows one
+    longest: float = 0.0  # the largest delay of a window or an observation, in seconds
+    slowest_warm_up: float | None = None  # stamps only: the largest delay during the warm-up, in seconds
+    drift: float | None = None  # stamps only: growth of the smallest delays, in parts per million: clocks run apart
+    curve: tuple[tuple[float, float, float], ...] = ()  # (dead time, strength, r of the best pair's increments) by lag
 
     @property
     def train_with(self) -> str:
@@ -165,9 +148,7 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
     delays, start = arrived - made, made - made[0]
     if (np.diff(made) < 0).any():
         row = int(np.argmax(np.diff(made) < 0)) + 2
-        raise DelayRLError(
-            f"{path}, row {row}: the stamp goes back; sort the rows by the time when observations were made"
-        )
+        raise DelayRLError(f"{path}, row {row}: the stamp goes back; sort the rows by when observations were made")
     if (np.diff(made) == 0).all():
         raise DelayRLError(f"{path}: every observation has the same stamp")
     if delays.min() < 0:
@@ -181,8 +162,7 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
     used = start >= warm
     if used.sum() < 10:
         raise DelayRLError(f"{path}: {used.sum()} rows are left after a warm-up of {warm:g} s: too few")
-    kept = delays[used]
-    period = period or row_spacing
+    kept, period = delays[used], period or row_spacing
     parts = np.array_split(np.arange(len(kept)), min(10, len(kept) // 2))
     times, least = np.array([(made[used][part].mean(), kept[part].min()) for part in parts]).T
     return Estimated(
@@ -209,23 +189,20 @@ def _correlated(
     used = log.time >= warm - row / 2
     rows = int(used.sum())
     if rows < LEAST_ROWS:
-        raise DelayRLError(
-            f"{path} is too short: {rows} rows after a warm-up of {warm:g} s; {LEAST_ROWS} are needed, better 1,000"
-        )
+        counted = f"{rows} rows after a warm-up of {warm:g} s"
+        raise DelayRLError(f"{path} is too short: {counted}; {LEAST_ROWS} are needed, better 1,000")
     commands, observations, episode = log.commands[used], log.observations[used], log.episode[used]
     for values, what in ((commands, "command"), (observations, "observation")):
         if (values == values[0]).all():
             raise DelayRLError(f"{path}: after a warm-up of {warm:g} s every {what} is constant")
     lags = min(100, rows // 10) if longest is None else int(np.ceil(longest / row)) + 1
     if lags > rows // 6:
-        raise DelayRLError(
-            f"{path}: {rows} rows of {row:g} s are too few to look for a delay of {lags * row:g} s: "
-            f"at most {rows // 6 * row:.3g} s"
-        )
+        tried = f"a delay of {lags * row:g} s: at most {rows // 6 * row:.3g} s"
+        raise DelayRLError(f"{path}: {rows} rows of {row:g} s are too few to look for {tried}")
     u, y = correlate.innovations(commands, observations, episode)
     blocks = int(np.clip(rows // (2 * lags), WINDOWS, BLOCKS)) // WINDOWS * WINDOWS  # windows are whole blocks
-    sums, sizes = correlate.blocks(u, y, lags, blocks)
-    correlation = correlate.correlation(sums, sizes, lags)
+    sums, size = correlate.blocks(u, y, lags, blocks)
+    correlation = correlate.correlation(sums, size, lags)
     first = correlate.onset(correlation)
     if first is None:
         raise DelayRLError(
@@ -233,16 +210,15 @@ def _correlated(
             "A longer log, other columns, or commands with some random variation may show one"
         )
     random = np.random.default_rng(seed)
-    onsets = [correlate.onset(c) for c in correlate.resampled(sums, sizes, lags, RESAMPLINGS, random)]
+    onsets = [correlate.onset(c) for c in correlate.resampled(sums, size, lags, RESAMPLINGS, random)]
     dead_times = [(lag - 1) * row for lag in onsets if lag is not None]
     low, high = np.quantile(dead_times, (0.025, 0.975)) if dead_times else (0.0, lags * row)
     low, high = max(0.0, low - row), high + row  # the log does not show what happens between two rows
-    windows = []
-    count = min(WINDOWS, rows // WINDOW_ROWS)
+    windows, count = [], min(WINDOWS, rows // WINDOW_ROWS)
     for part in np.array_split(np.arange(len(sums)), count) if count > 1 else []:
-        lag = correlate.onset(correlate.correlation(sums[part], sizes[part], lags))
+        lag = correlate.onset(correlate.correlation(sums[part], size, lags))
         if lag is not None:
-            windows.append((float(warm + part.mean() * sizes[0] * row + sizes[0] * row / 2), (lag - 1) * row))
+            windows.append((float(warm + part.mean() * size * row + size * row / 2), (lag - 1) * row))
     pairs, r = _pairs(log, commands, observations, episode, lags, row)
     strength = correlate.strength(correlation)[0]
     delay = (first - 1) * row
@@ -272,8 +248,7 @@ def _pairs(
 ) -> tuple[tuple[Pair, ...], Array]:
     """Return all pairs, the strongest correlation of increments first, and the correlations of the first pair, [L]."""
     u, y = correlate.increments(commands, episode), correlate.increments(observations, episode)
-    sums, sizes = correlate.blocks(u, y, lags, 1)
-    near = correlate.correlation(sums, sizes, lags).near
+    near = correlate.correlation(*correlate.blocks(u, y, lags, 1), lags).near
     pairs: list[tuple[Pair, Array]] = []
     for i, command in enumerate(log.command_names):
         for j, observation in enumerate(log.observation_names):
@@ -286,12 +261,7 @@ def _pairs(
 def plot(estimated: Estimated, out: Path) -> None:
     """Plot how far each lag is from chance, or with stamps how often each delay occurs.
 
-    Args:
-        estimated: the result of `from_log`.
-        out: the picture; its suffix sets the format.
-
-    Raises:
-        DelayRLError: a suffix that matplotlib does not know.
+    The suffix of `out` sets the format. Raises DelayRLError if matplotlib does not know it.
     """
     import matplotlib
 

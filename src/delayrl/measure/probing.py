@@ -32,35 +32,21 @@ STARTS = 4  # episodes tried for each scale
 
 @dataclass(frozen=True)
 class Probed:
-    """The delays of an environment, in its steps, each as {steps: how often}.
+    """The delays of an environment, in its steps, each as {steps: how often}."""
 
-    Attributes:
-        environment: its name.
-        total: for each step, the age of the newest action whose effect is in the observation.
-        action: for each action, steps until the state (or the reward, see `action_from`) reacts; None if unknown.
-        observation: for each step, the age of the shown state; None if unknown.
-        reaction: for each action, steps until an observation first reacts.
-        action_from: what shows that an action has acted.
-        lost: share of the actions that changed nothing (overtaken, held, saturated).
-        components: for each component of the observation, the fewest steps until it reacts; None if it never does.
-        echoes: components that repeat the action itself, and do not count as a reaction.
-        episodes, length, seed: how many episodes of how many steps, and the first seed.
-        scale: size of the push, relative to the largest.
-    """
-
-    environment: str
-    total: Counts
-    action: Counts | None
-    observation: Counts | None
-    reaction: Counts
-    action_from: str
-    lost: float
-    components: tuple[int | None, ...]
-    echoes: tuple[int, ...]
+    environment: str  # its name
+    total: Counts  # for each step, the age of the newest action whose effect is in the observation
+    action: Counts | None  # for each action, steps until the state (or see `action_from`) reacts; None if unknown
+    observation: Counts | None  # for each step, the age of the shown state; None if unknown
+    reaction: Counts  # for each action, steps until an observation first reacts
+    action_from: str  # what shows that an action has acted
+    lost: float  # share of the actions that changed nothing (overtaken, held, saturated)
+    components: tuple[int | None, ...]  # fewest steps until each component of the observation reacts; None if never
+    echoes: tuple[int, ...]  # components that repeat the action itself, and do not count as a reaction
     episodes: int
-    length: int
-    seed: int
-    scale: float
+    length: int  # steps of an episode, at most
+    seed: int  # of the first episode
+    scale: float  # size of the push, relative to the largest
 
     @property
     def maximum(self) -> int:
@@ -125,27 +111,27 @@ def _gather(
 ) -> Probed:
     oldest = max((int(age.max()) for age in ages if (age >= 0).any()), default=oldest)
     total = _count_ages(ages, oldest)
-    reaction = Counter(d for p in pushes for d in _settled(p, "obs", oldest))
+    reaction = _count(d for p in pushes for d in _settled(p, "obs", oldest))
     if not total and not reaction:
         raise DelayRLError(f"{name}: its episodes end too early to see a delay of about {oldest} steps")
-    lost = [(p.obs[k, 1:] != 1).all() for p in pushes for k in range(len(p.obs)) if _is_long_enough(p, k, oldest)]
+    # only pushes that enough steps follow to show any effect
+    lost = [(row[1:] != 1).all() for p in pushes for k, row in enumerate(p.obs) if (row >= 0).sum() > k + 1 + oldest]
     action_from, channel = _action_channel(pushes)
-    action: Counts | None = None
-    observation: Counts | None = None
+    action: Counts = {}
+    observation: Counts = {}
     if channel:
-        action = Counter(d for p in pushes for d in _settled(p, channel, oldest))
+        action = _count(d for p in pushes for d in _settled(p, channel, oldest))
         observation = _count_ages([_shown(p.obs, p.channel(channel)) for p in pushes], oldest)
     echo = np.any([p.echo.any(0) for p in pushes], axis=0)
-    reactions = np.concatenate(
-        [np.where(p.components > 0, p.components - 1 - np.arange(len(p.obs))[:, None], -1) for p in pushes]
-    )
+    steps_to = [np.where(p.components > 0, p.components - 1 - np.arange(len(p.obs))[:, None], -1) for p in pushes]
+    reactions = np.concatenate(steps_to)
     fewest = np.where(reactions >= 0, reactions, np.iinfo(int).max).min(0)
     return Probed(
         environment=name,
-        total=_ordered(total or reaction),
-        action=_ordered(action) if action else None,
-        observation=_ordered(observation) if observation else None,
-        reaction=_ordered(reaction),
+        total=total or reaction,
+        action=action or None,
+        observation=observation or None,
+        reaction=reaction,
         action_from=action_from,
         lost=float(np.mean(lost)) if lost else 0.0,
         components=tuple(None if (reactions[:, c] < 0).all() else int(steps) for c, steps in enumerate(fewest)),
@@ -203,10 +189,8 @@ def _check_repeats(name: str, played: Rollout, again: Rollout) -> None:
 
 def _action_channel(pushes: list[Pushes]) -> tuple[str, str]:
     """Return what shows that an action has acted, in words and as a channel: the state, or else the first reward."""
-    for channel, label in (
-        ("state", pushes[0].state_from),
-        ("rest", "the first reward that differs (no state is visible)"),
-    ):
+    labels = {"state": pushes[0].state_from, "rest": "the first reward that differs (no state is visible)"}
+    for channel, label in labels.items():
         pairs = [(a, o) for p in pushes for a, o in zip(p.channel(channel), p.channel("obs"), strict=True) if o > 0]
         acted = [a > 0 and a <= o for a, o in pairs]
         if label and acted and all(acted):
@@ -218,9 +202,7 @@ def _total(effect: Array) -> Array:
     """Return the age at each step of the newest action with an effect, [T+1]; -1 if unknown."""
     count, length = effect.shape
     ages = np.full(length, -1)
-    for t in range(1, length):
-        if t > count:
-            break
+    for t in range(1, min(length, count + 1)):
         column = effect[:t, t]
         newest = np.flatnonzero(column == 1)
         if newest.size and (column[newest[-1] + 1 :] == 0).all():
@@ -246,12 +228,6 @@ def _shown(effect: Array, acted: Array) -> Array:
     return ages
 
 
-def _is_long_enough(pushes: Pushes, k: int, longest: int) -> bool:
-    """Whether enough steps follow push k to show any effect."""
-    t = k + 1 + longest
-    return t < pushes.obs.shape[1] and bool(pushes.obs[k, t] != -1)
-
-
 def _settled(pushes: Pushes, channel: str, longest: int) -> list[int]:
     """Return the delays of the pushes that enough steps follow."""
     delays = pushes.delays(channel)
@@ -260,11 +236,11 @@ def _settled(pushes: Pushes, channel: str, longest: int) -> list[int]:
 
 def _count_ages(ages: list[Array], oldest: int) -> Counts:
     """Count the known ages, without the first steps of an episode, in which no action can be old."""
-    return Counter(int(a) for age in ages for t, a in enumerate(age) if a >= 0 and t > oldest)
+    return _count(int(a) for age in ages for t, a in enumerate(age) if a >= 0 and t > oldest)
 
 
-def _ordered(counts: Counts) -> Counts:
-    return {steps: counts[steps] for steps in sorted(counts)}
+def _count(steps: Iterable[int]) -> Counts:
+    return dict(sorted(Counter(steps).items()))
 
 
 def _make(env: str | Env | Callable[[], Env]) -> Env:
@@ -274,14 +250,13 @@ def _make(env: str | Env | Callable[[], Env]) -> Env:
         from delayrl.envs import make
 
         return make(env).env
+    name = getattr(env, "__name__", env)
     try:
         made = env()
     except Exception as error:
-        raise DelayRLError(f"{getattr(env, '__name__', env)}() failed: {_described(error)}") from error
+        raise DelayRLError(f"{name}() failed: {_described(error)}") from error
     if not isinstance(made, gym.Env):
-        raise DelayRLError(
-            f"{getattr(env, '__name__', env)}() must return a Gymnasium environment; got {type(made).__name__}"
-        )
+        raise DelayRLError(f"{name}() must return a Gymnasium environment; got {type(made).__name__}")
     return made
 
 

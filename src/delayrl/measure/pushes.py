@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 Env = gym.Env[Any, Any]
 Array = NDArray[Any]
 
-STATES = ("MuJoCo's qpos and qvel", "env.unwrapped.state", 'info["truth"]')
-
 
 @dataclass(frozen=True)
 class Rollout:
@@ -75,7 +73,7 @@ def push(
         effect["obs"][k, :played] = (different & ~echo[k]).any(1)
         effect["state"][k, :played] = differs(base.state[:played], roll.state[:played]).any(1)
         effect["rest"][k, :played] = differs(base.rest[:played], roll.rest[:played]).any(1)
-    return Pushes(effect["obs"], effect["state"], effect["rest"], np.where(echo, -1, components), echo, base.state_from)
+    return Pushes(**effect, components=np.where(echo, -1, components), echo=echo, state_from=base.state_from)
 
 
 def play(env: Env, seed: int, chosen: Array) -> Rollout:
@@ -111,8 +109,9 @@ def _state(env: Env, info: dict[str, Any]) -> tuple[Array, str]:
     """Return the simulator's true state and where it was read; an empty array and "" if it is hidden."""
     data = getattr(env.unwrapped, "data", None)
     if hasattr(data, "qpos") and hasattr(data, "qvel"):
-        return np.concatenate([np.array(data.qpos).ravel(), np.array(data.qvel).ravel()]), STATES[0]  # type: ignore[union-attr]
-    for value, name in ((getattr(env.unwrapped, "state", None), STATES[1]), (info.get("truth"), STATES[2])):
+        return np.concatenate([np.ravel(data.qpos), np.ravel(data.qvel)]), "MuJoCo's qpos and qvel"  # type: ignore[union-attr]
+    state = getattr(env.unwrapped, "state", None)
+    for value, name in ((state, "env.unwrapped.state"), (info.get("truth"), 'info["truth"]')):
         if isinstance(value, np.ndarray | tuple | list):
             try:
                 return np.array(value, float).ravel(), name
@@ -141,8 +140,7 @@ def first(effect: Array) -> Array:
 
 def _bounds(env: Env) -> tuple[Array, Array]:
     """Return the bounds of the actions, [A] each; ±1 for a missing bound."""
-    space = env.action_space
-    assert isinstance(space, Box)
+    space: Any = env.action_space
     low, high = space.low.astype(float), space.high.astype(float)
     bounded = (np.abs(low) < 1e6) & (np.abs(high) < 1e6)
     return np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)

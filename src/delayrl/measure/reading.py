@@ -8,16 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError, first_line
-
-Array = NDArray[np.float64]
+from delayrl.measure.correlate import Array
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PREFIXES = {"commands": ("command", "cmd", "action"), "observations": ("observation", "obs")}
-TIMES = ("time", "timestamp", "t")
-EPISODES = ("episode", "episode_index")
 GAP = 20  # rows that may be missing within one recording
 
 
@@ -49,7 +45,7 @@ def read_signals(
     CSV files need a header, and separate columns with commas, semicolons or tabs.
     """
     table = _Table(path)
-    stamps = table.find(time, TIMES, "time stamps", "--time")
+    stamps = table.find(time, ("time", "timestamp", "t"), "time stamps", "--time", needed=True)
     groups = {}
     for what, given in (("commands", commands), ("observations", observations)):
         starts = tuple(given or PREFIXES[what])
@@ -63,7 +59,7 @@ def read_signals(
     both = set(groups["commands"]) & set(groups["observations"])
     if both:
         raise DelayRLError(f"{path}: {_few(sorted(both))} would be both a command and an observation; use --commands")
-    number = table.find(episode, EPISODES, "episodes", "--episode", needed=episode is not None)
+    number = table.find(episode, ("episode", "episode_index"), "episodes", "--episode")
     seconds = table.column(stamps) * UNITS[unit]
     episodes = table.column(number) if number else np.zeros(len(seconds))
     _check_times(path, stamps, seconds, episodes)
@@ -78,8 +74,8 @@ def read_signals(
 def read_stamps(path: Path, stamp: str | None, received: str | None, unit: str) -> tuple[Array, Array] | None:
     """Return when observations were made and when they arrived, in seconds, [N] each; None without both columns."""
     table = _Table(path)
-    made = table.find(stamp, ("stamp",), "send times", "--stamp", needed=stamp is not None)
-    arrived = table.find(received, ("received",), "arrival times", "--received", needed=received is not None)
+    made = table.find(stamp, ("stamp",), "send times", "--stamp")
+    arrived = table.find(received, ("received",), "arrival times", "--received")
     if not made or not arrived:
         return None
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit]
@@ -119,9 +115,9 @@ class _Table:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        head = path.read_bytes()[:4] if path.is_file() else None
-        if head is None:
+        if not path.is_file():
             raise DelayRLError(f"{path}: no such file")
+        head = path.read_bytes()[:4]
         if not head:
             raise DelayRLError(f"{path} is empty")
         self._columns: dict[str, Any] = _parquet(path) if head == b"PAR1" else _csv(path)
@@ -129,13 +125,13 @@ class _Table:
         if not self.names or not len(self._columns[self.names[0]]):
             raise DelayRLError(f"{path} has no rows")
 
-    def find(self, given: str | None, usual: tuple[str, ...], what: str, option: str, needed: bool = True) -> str:
+    def find(self, given: str | None, usual: tuple[str, ...], what: str, option: str, needed: bool = False) -> str:
         """Return the name of a column: the given one or else a usual one, or "" if there is none and none is needed."""
         wanted = (given,) if given else usual
         for name in wanted:
             if name in self._columns:
                 return name
-        if needed:
+        if needed or given is not None:
             raise DelayRLError(
                 f"{self.path}: no column {' or '.join(map(str, wanted))} for the {what}; name it with {option}. "
                 f"It has {_few(self.names)}"
@@ -191,9 +187,8 @@ def _csv(path: Path) -> dict[str, list[str]]:
     if len(names) < 2 or all(map(_number, names)):
         raise DelayRLError(f"{path} has no header of column names in its first line; or it is neither CSV nor Parquet")
     if len(set(names)) < len(names):
-        raise DelayRLError(
-            f"{path} has two columns of the same name: {_few(sorted(n for n in names if names.count(n) > 1))}"
-        )
+        twice = sorted(name for name in names if names.count(name) > 1)
+        raise DelayRLError(f"{path} has two columns of the same name: {_few(twice)}")
     for i, row in enumerate(rows[1:]):
         if len(row) != len(names):
             raise DelayRLError(f"{path}, row {i + 1}: {len(row)} cells under {len(names)} column names")

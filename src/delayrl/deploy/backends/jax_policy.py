@@ -14,7 +14,7 @@ from delayrl.deploy.backends.network import Act, Arrays, Network
 
 def jax_policy(network: Network, arrays: Arrays) -> Act:
     """Return the policy as a function, which its first call compiles."""
-    params = _tree(arrays)
+    params = jax.device_put(_tree(arrays))
     low, high = jnp.asarray(network.low), jnp.asarray(network.high)
 
     @jax.jit
@@ -31,8 +31,6 @@ def jax_policy(network: Network, arrays: Arrays) -> Act:
             raw = jnp.where(age > 0, raw, networks.mlp(params["current"], obs))
         return low + (jnp.tanh(raw) + 1) / 2 * (high - low)
 
-    params = jax.device_put(params)
-
     def on_host(obs: NDArray[np.float32], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
         return np.asarray(act(params, obs, actions, np.int32(age)))
 
@@ -41,19 +39,11 @@ def jax_policy(network: Network, arrays: Arrays) -> Act:
 
 def _tree(arrays: Arrays) -> Any:
     """Split names at their dots: return nested dictionaries, or lists where the names are numbers."""
-    root: dict[str, Any] = {}
+    if "" in arrays:
+        return arrays[""]
+    groups: dict[str, dict[str, Any]] = {}
     for name, array in arrays.items():
-        *path, leaf = name.split(".")
-        node = root
-        for part in path:
-            node = node.setdefault(part, {})
-        node[leaf] = array
-
-    def lists(node: Any) -> Any:
-        if not isinstance(node, dict):
-            return node
-        if all(key.isdigit() for key in node):
-            return [lists(node[str(i)]) for i in range(len(node))]
-        return {key: lists(value) for key, value in node.items()}
-
-    return lists(root)
+        first, _, rest = name.partition(".")
+        groups.setdefault(first, {})[rest] = array
+    tree = {name: _tree(group) for name, group in groups.items()}
+    return [tree[str(i)] for i in range(len(tree))] if all(name.isdigit() for name in tree) else tree

@@ -22,27 +22,20 @@ LONGEST_AGE, LARGEST_HISTORY = 10_000, 10_000_000
 class Network:
     """Describe a deterministic policy: tanh of an MLP with ReLU, scaled from [-1, 1] to low .. high.
 
-    Attributes:
-        obs_size, action_size: S and A.
-        max_age: Δ, the longest age that it was trained for, in steps.
-        low, high: the range of the actions, [A], in the task's units.
-        input: what the MLP `head` reads: "observation" [S]; "augmented" [S + Δ·A + 1], which is the observation, the
-            scaled actions since (zeros after the first `age`) and age / Δ; or "transformer" [width], the encoder's
-            output at the age.
-        hidden: widths of the head's hidden layers.
-        current: hidden widths of a second MLP, which reads the observation and acts at age 0; None if there is none.
-        width, blocks: sizes of the encoder; 0 if there is none.
+    `input` is what the MLP `head` reads: "observation" [S]; "augmented" [S + Δ·A + 1], which is the observation, the
+    scaled actions since (zeros after the first `age`) and age / Δ; or "transformer" [width], the encoder's output at
+    the age. A second MLP, `current`, may act at age 0. It reads the observation.
     """
 
-    obs_size: int
-    action_size: int
-    max_age: int
-    low: tuple[float, ...]
+    obs_size: int  # S
+    action_size: int  # A
+    max_age: int  # Δ, the longest age that it was trained for, in steps
+    low: tuple[float, ...]  # the range of the actions, [A], in the task's units
     high: tuple[float, ...]
     input: str
-    hidden: tuple[int, ...]
-    current: tuple[int, ...] | None = None
-    width: int = 0
+    hidden: tuple[int, ...]  # widths of the head's hidden layers
+    current: tuple[int, ...] | None = None  # widths of its hidden layers; None if there is no such MLP
+    width: int = 0  # sizes of the encoder; 0 if there is none
     blocks: int = 0
 
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -79,18 +79,13 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
     gained = graph("Mul", graph("Add", unit, graph.constant(1)), graph.constant((high - low) / 2))
     graph("Add", gained, graph.constant(low), output="action")
 
-    inputs = [
-        helper.make_tensor_value_info("obs", TensorProto.FLOAT, [network.obs_size]),
-        helper.make_tensor_value_info("actions", TensorProto.FLOAT, [network.max_age, network.action_size]),
-        helper.make_tensor_value_info("age", TensorProto.INT64, []),
-    ]
-    outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, [network.action_size])]
-    model = helper.make_model(
-        helper.make_graph(graph.nodes, "delayrl", inputs, outputs, graph.constants),
-        producer_name="delayrl",
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR,
-    )
+    declare, real = helper.make_tensor_value_info, TensorProto.FLOAT
+    inputs = [declare("obs", real, [network.obs_size])]
+    inputs += [declare("actions", real, [network.max_age, network.action_size]), declare("age", TensorProto.INT64, [])]
+    outputs = [declare("action", real, [network.action_size])]
+    body = helper.make_graph(graph.nodes, "delayrl", inputs, outputs, graph.constants)
+    opsets = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(body, producer_name="delayrl", opset_imports=opsets, ir_version=IR)
     text = json.dumps(metadata, sort_keys=True).replace("location", "l\\u006fcation")  # see onnx_policy.LOCATION
     helper.set_model_props(model, {"delayrl": text})
     onnx.checker.check_model(model, full_check=True)

@@ -26,18 +26,17 @@ A command that takes effect κ steps after it was given (`action_delay`) has its
 flight are in the history, and an observation that is made now has the age κ.
 """
 
-import operator
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delayrl.deploy.runtime.clock import Clock, Stamps
 from delayrl.deploy.runtime.episode import Episode
-from delayrl.deploy.runtime.history import Action, History
+from delayrl.deploy.runtime.history import Action, Clock, History, Stamps
 from delayrl.deploy.runtime.telemetry import Arrival, Statistics, Telemetry
 from delayrl.errors import DelayRLError
 
@@ -58,28 +57,20 @@ class OverrunError(DelayRLError):
 
 
 class ControlPolicy(Protocol):
-    """A policy that a controller can run: a function with its sizes and ranges.
+    """A policy that a controller can run: a function with its sizes and ranges."""
 
-    Attributes:
-        obs_size, action_size: S and A.
-        low, high: the range of the actions, [A].
-        max_age: Δ, the longest age that it accepts, in steps.
-        dt: seconds a step; None if unknown.
-    """
-
-    obs_size: int
-    action_size: int
-    low: NDArray[Any]
-    high: NDArray[Any]
-    max_age: int
-    dt: float | None
+    obs_size: int  # S
+    action_size: int  # A
+    low: NDArray[Any]  # [A], the least action in range
+    high: NDArray[Any]  # [A], the largest
+    max_age: int  # Δ, the longest age that it accepts, in steps
+    dt: float | None  # seconds a step; None if unknown
 
     def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
         """Return the action [A] for an observation [S] of this age and the actions [Δ, A] since.
 
         The actions are in order, oldest first; zeros follow the first `age` of them.
         """
-        ...
 
 
 class Controller:
@@ -118,16 +109,19 @@ class Controller:
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
         self.action_delay = _action_delay(policy, action_delay)
         self._clock = Clock(stamps, policy.dt if stamps == "seconds" and dt is None else dt, clock)
-        self._idle = None if idle is None else _action(policy, idle, "idle")
+        steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
-        self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._new_history())
+        first = _in_range(policy, np.zeros(policy.action_size, np.float32))
+        capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
+        self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
+        self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
         policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
 
     @property
     def ready(self) -> bool:
         """Whether an observation has arrived in this episode."""
-        return self._episode.ready
+        return self._episode.obs is not None
 
     @property
     def episode(self) -> int:
@@ -148,12 +142,11 @@ class Controller:
     def reset(self, now: float | None = None) -> None:
         """Start an episode: forget observations and actions. Later stamps before `now` (seconds) are ignored.
 
-        Raises:
-            ClockError: `now` is not finite, or beyond ±1e15.
+        Raises ClockError if `now` is not finite, or beyond ±1e15.
         """
         with self._act_lock, self._state_lock:
             start = 0.0 if self.stamps == "steps" else self._clock.now(now, 0)
-            self._episode = Episode(self.episode + 1, start, self._clock, self._new_history())
+            self._episode = Episode(self.episode + 1, start, self._clock, self._history())
 
     def observe(self, obs: ArrayLike, stamp: float, now: float | None = None, *, episode: int | None = None) -> Arrival:
         """Take in an observation. Call it for every one that arrives, in any order and as often as it arrives.
@@ -215,9 +208,8 @@ class Controller:
     def override(self, action: ArrayLike, now: float | None = None) -> None:
         """Record a command that somebody else (a person, a safe stop) gives to the plant at `now`, in place of `act`.
 
-        Raises:
-            DelayRLError: a wrong size, or not finite.
-            ClockError: `now` is not after the last call.
+        Raises DelayRLError for a wrong size or numbers that are not finite, and ClockError if `now` is not after the
+        last call.
         """
         values = _action(self.policy, action, "the action")
         with self._act_lock, self._state_lock:
@@ -227,29 +219,13 @@ class Controller:
     def applied(self, action: ArrayLike, step: int | None = None) -> bool:
         """Correct the history where the plant did something else: an actuator saturated, a packet was lost.
 
-        Args:
-            action: what the plant did, [A]; it may lie outside the policy's range.
-            step: as `controller.step` was after `act`; None for the newest.
-
-        Returns:
-            Whether the step is still remembered.
-
-        Raises:
-            DelayRLError: a wrong size, not finite, or a step that has no action.
+        `action` is what the plant did, [A]; it may lie outside the policy's range. `step` is `controller.step` as it
+        was after `act`, None for the newest. Returns whether the step is still remembered. Raises DelayRLError for a
+        wrong size, numbers that are not finite, or a step that has no action.
         """
         values = _action(self.policy, action, "the action")
         with self._state_lock:
-            history = self._episode.history
-            step = history.length - 1 if step is None else _step(step)
-            if not 0 <= step < history.length:
-                raise DelayRLError(f"there are actions of {history.length} steps, from 0 on; got step {step}")
-            return history.correct(values, step)
-
-    def _new_history(self) -> History:
-        first = _in_range(self.policy, np.zeros(self.policy.action_size, np.float32))
-        capacity = self.policy.max_age + self.action_delay + EXTRA_STEPS
-        counts = self._telemetry.counts
-        return History(self._clock.period, self.action_delay, capacity, self._idle, first, counts)
+            return self._episode.history.correct(values, step)
 
 
 def _action_delay(policy: ControlPolicy, given: Any) -> int:
@@ -294,10 +270,3 @@ def _numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
             return np.array(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:
         raise DelayRLError(f"a flat array of numbers is needed; got {' '.join(repr(values).split())[:80]}") from error
-
-
-def _step(step: int) -> int:
-    try:
-        return operator.index(step)
-    except TypeError:
-        raise DelayRLError(f"a step is a whole number; got {step!r}") from None

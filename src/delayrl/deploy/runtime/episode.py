@@ -6,24 +6,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.deploy.runtime.clock import LARGEST_TIME, Clock, ClockError
-from delayrl.deploy.runtime.history import Action, History
+from delayrl.deploy.runtime.history import LARGEST_TIME, Action, Clock, ClockError, History
 from delayrl.deploy.runtime.telemetry import Arrival
 from delayrl.errors import DelayRLError
 
 
 class Newest(NamedTuple):
-    """The newest observation, seen from a command.
-
-    `actions` are those since, oldest first; fewer than the age if the oldest are no longer remembered. `delay` is the
-    time from the stamp to the command. `warm` says whether the observation was made after the first command.
-    """
+    """The newest observation, seen from a command."""
 
     obs: NDArray[np.float64]
     age: int
-    actions: list[Action]
-    delay: float
-    warm: bool
+    actions: list[Action]  # those since, oldest first; fewer than the age if the oldest are no longer remembered
+    delay: float  # the time from the stamp to the command
+    warm: bool  # whether the observation was made after the first command
 
 
 class Episode:
@@ -32,20 +27,15 @@ class Episode:
     def __init__(self, number: int, start: float, clock: Clock, history: History) -> None:
         self.number, self.history = number, history
         self._start, self._clock = start, clock
-        self._obs: NDArray[np.float64] | None = None
+        self.obs: NDArray[np.float64] | None = None  # the newest
         self._stamp = self._last_command = -math.inf
         self._first_command: int | None = None  # in steps from the start
-
-    @property
-    def ready(self) -> bool:
-        """Whether an observation has arrived."""
-        return self._obs is not None
 
     def observe(self, obs: NDArray[np.float64], stamp: float, now: float | None, episode: int | None) -> Arrival:
         """Keep an observation if it is the newest; return what became of it."""
         arrival = self._judge(obs, stamp, now, episode)
         if arrival == "new":
-            self._obs, self._stamp = obs, stamp
+            self.obs, self._stamp = obs, stamp
             if self._start == -math.inf:
                 self._start = stamp
         return arrival
@@ -54,22 +44,20 @@ class Episode:
         """Return `now` as a float. Raises ClockError unless it is after the last command."""
         time = self._now(now)
         if time <= self._last_command:
-            raise ClockError(
-                f"time went backwards: now is {time:g}, the last command was given at {self._last_command:g}"
-            )
+            raise ClockError(f"time went backwards: now is {time:g}, the last command was at {self._last_command:g}")
         if self._clock.stamps == "steps" and time < 0:
             raise ClockError(f"steps count from 0; now is {time:g}")
         return time
 
     def newest(self, now: float) -> Newest:
         """Return the newest observation with its age. Raises DelayRLError if none has arrived before `now`."""
-        if self._obs is None:
+        if self.obs is None:
             raise DelayRLError("no observation has arrived in this episode: wait until `controller.ready`")
         if self._stamp > now + self._clock.period / 2:
             raise ClockError(f"time went backwards: now is {now:g}, an observation of {self._stamp:g} is here")
         step, age, actions = self.history.age(self._stamp, now, self._elapsed(now))
         warm = self._first_command is not None and step > self._first_command
-        return Newest(self._obs.copy(), age, actions, now - self._stamp, warm)
+        return Newest(self.obs.copy(), age, actions, now - self._stamp, warm)
 
     def record(self, action: Action, now: float) -> float:
         """Add a command to the history. Returns the time since the last one, infinite for the first."""

@@ -1,15 +1,72 @@
-"""The steps that a plant has gone through, and the action that it was given in each.
+"""Times as a controller takes them, and the steps that a plant has gone through, with the action of each.
 
 Steps are numbered from the start of the episode. Only the newest ones are remembered.
 """
 
 import math
+import operator
 from collections import deque
+from collections.abc import Callable
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from delayrl.errors import DelayRLError
+
 Action = NDArray[np.float32]
+Stamps = Literal["steps", "seconds"]
+SHORTEST_STEP, LONGEST_STEP = 1e-6, 1e6
+"""Bounds of a step, in seconds."""
+LARGEST_TIME = 1e15
+"""The largest distance from 0, in steps or seconds. Beyond it, floating point cannot tell neighbouring times apart."""
+
+
+class ClockError(DelayRLError):
+    """Time did not go forward."""
+
+
+class Clock:
+    """Check times, and read the present one.
+
+    Args:
+        stamps: the unit of all times.
+        dt: seconds a step; None for stamps in steps.
+        read: returns the present time in seconds.
+    """
+
+    def __init__(self, stamps: Stamps, dt: Any, read: Callable[[], float]) -> None:
+        if stamps not in get_args(Stamps):
+            raise DelayRLError(f"stamps are in steps or in seconds; got {stamps!r}")
+        if stamps == "steps" and dt is not None:
+            raise DelayRLError("dt goes with stamps='seconds'; steps have no length")
+        valid = isinstance(dt, int | float | np.number) and not isinstance(dt, bool)
+        if stamps == "seconds" and not (valid and SHORTEST_STEP <= dt <= LONGEST_STEP):
+            allowed = f"{SHORTEST_STEP:g} .. {LONGEST_STEP:g}"
+            raise DelayRLError(f"stamps in seconds need the seconds of a step, {allowed}: give dt=…; got {dt!r}")
+        self.stamps, self._read = stamps, read
+        self.period = 1.0 if dt is None else float(dt)
+
+    def number(self, time: float) -> float:
+        """Return a time as a float. Raises DelayRLError if it is not a number, or a fraction of a step."""
+        if isinstance(time, bool | np.bool_) or not isinstance(time, int | float | np.integer | np.floating):
+            raise DelayRLError(f"a time is a number of {self.stamps}; got {time!r}")
+        try:
+            value = float(time)
+        except OverflowError:  # an integer beyond the range of floats
+            value = math.inf if time > 0 else -math.inf
+        if self.stamps == "steps" and math.isfinite(value) and value != math.floor(value):
+            raise DelayRLError(f"steps are whole numbers; got {time!r}. For seconds: stamps='seconds'")
+        return value
+
+    def now(self, now: float | None, step: int) -> float:
+        """Return `now` as a float; if it is None, the time on the clock, or `step` with stamps in steps."""
+        if now is None:
+            now = self._read() if self.stamps == "seconds" else step
+        value = self.number(now)
+        if not abs(value) <= LARGEST_TIME:
+            raise ClockError(f"now must be finite, within ±{LARGEST_TIME:g}; got {value}")
+        return value
 
 
 class History:
@@ -79,9 +136,15 @@ class History:
         self._begins.extend(added)
         self.length += gap
 
-    def correct(self, action: Action, step: int) -> bool:
-        """Replace the action of a step. Returns False if the step is no longer remembered."""
-        position = step - (self.length - len(self._actions))
+    def correct(self, action: Action, step: int | None) -> bool:
+        """Replace the action of a step, of the newest if None. Returns False if the step is no longer remembered."""
+        try:
+            number = self.length - 1 if step is None else operator.index(step)
+        except TypeError:
+            raise DelayRLError(f"a step is a whole number; got {step!r}") from None
+        if not 0 <= number < self.length:
+            raise DelayRLError(f"there are actions of {self.length} steps, from 0 on; got step {number}")
+        position = number - (self.length - len(self._actions))
         if position >= 0:
             self._actions[position] = action
         return position >= 0

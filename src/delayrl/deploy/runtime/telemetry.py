@@ -2,9 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-from delayrl.deploy.runtime.clock import Stamps
+from delayrl.deploy.runtime.history import Stamps
 
 Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
 """What became of an observation; see `Statistics`. Only new ones are used."""
@@ -41,29 +41,22 @@ class Statistics:
 
 
 class Moments:
-    """The mean, standard deviation and maximum of a stream of numbers."""
+    """The mean and the population standard deviation of a stream of numbers."""
 
     def __init__(self) -> None:
-        self.count, self.largest = 0, -math.inf
-        self._mean, self._squares = 0.0, 0.0
+        self.count, self._mean, self._squares = 0, 0.0, 0.0
 
     def add(self, value: float) -> None:
         """Update the moments with one more number."""
         self.count += 1
-        self.largest = max(self.largest, value)
         change = value - self._mean
         self._mean += change / self.count
         self._squares += change * (value - self._mean)
 
-    @property
-    def mean(self) -> float:
-        """The mean so far; NaN if there are no numbers."""
-        return self._mean if self.count else math.nan
-
-    @property
-    def std(self) -> float:
-        """The population standard deviation so far; NaN if there are no numbers."""
-        return math.sqrt(self._squares / self.count) if self.count else math.nan
+    def named(self, name: str) -> dict[str, Any]:
+        """Return both under the names of `Statistics`; NaN if there are no numbers."""
+        mean, std = (self._mean, math.sqrt(self._squares / self.count)) if self.count else (math.nan, math.nan)
+        return {f"{name}_mean": mean, f"{name}_std": std}
 
 
 class Telemetry:
@@ -74,24 +67,17 @@ class Telemetry:
         names = ("decisions", "overruns", "missed", "replaced", "overridden", *get_args(Arrival))
         self.counts = dict.fromkeys(names, 0)
         self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
+        self._age_max = 0
 
     def add(self, age: int, delay: float, period: float) -> None:
         """Add a decision: the age in steps, the time since its observation was made and since the last command."""
         self._ages.add(age)
+        self._age_max = max(self._age_max, age)
         if self._stamps == "seconds":
             self._delays.add(delay)
             self._periods.add(period)
 
     def snapshot(self) -> Statistics:
         """Return all numbers so far."""
-        return Statistics(
-            **self.counts,
-            counted=self._ages.count,
-            age_mean=self._ages.mean,
-            age_std=self._ages.std,
-            age_max=int(self._ages.largest) if self._ages.count else 0,
-            delay_mean=self._delays.mean,
-            delay_std=self._delays.std,
-            period_mean=self._periods.mean,
-            period_std=self._periods.std,
-        )
+        moments = self._ages.named("age") | self._delays.named("delay") | self._periods.named("period")
+        return Statistics(**self.counts, **moments, counted=self._ages.count, age_max=self._age_max)
