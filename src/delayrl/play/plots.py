@@ -12,12 +12,7 @@ COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
 
 def curve(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw the learning curve of a run: the mean and the range of the returns of each evaluation, against steps.
-
-    Args:
-        rows: the rows of the run; nothing is drawn where there are none.
-        path: the file to write.
-    """
+    """Draw the learning curve of a run: the mean and the range of each evaluation's returns, against steps."""
     if not rows:
         return
     returns: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -33,12 +28,7 @@ def curve(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def against_delay(results: list[dict[str, Any]], path: Path) -> None:
-    """Draw the returns of one policy against the delay: the mean and the range of the episodes.
-
-    Args:
-        results: what `sweep` yields, one dictionary for each delay.
-        path: the file to write.
-    """
+    """Draw the returns of one policy against the delay: mean and range of the episodes that `sweep` yields."""
     first = results[0]
     with _axes(path) as axes:
         _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOURS["agent"], first["agent"])

@@ -13,12 +13,6 @@ from delayrl.errors import DelayRLError, first_line
 def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -> tuple[int, float]:
     """Play one episode of a run's policy, and write it to an .mp4 or .gif file.
 
-    Args:
-        run: the run folder.
-        out: the file.
-        delay: any delay that the policy can serve; None for the one it was trained for.
-        seed: seed of the start state.
-
     Returns:
         The number of frames, and the return.
 

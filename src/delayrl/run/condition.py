@@ -10,20 +10,13 @@ from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.registry import find_agent
 from delayrl.core.protocol import Protocol
 from delayrl.core.types import Spec
-from delayrl.delays import Channel, Delay, DelayLaw, as_delay, short_label
+from delayrl.delays import Delay, DelayLike, as_delay, short_label
 from delayrl.envs import delay_of
 from delayrl.errors import DelayRLError
 from delayrl.run.configuration import check_names, override, values_of
+from delayrl.run.rows import CONDITION
 
-KINDS: dict[str, Any] = {
-    "agent": str,
-    "env": str,
-    "delay": int | str,
-    "preset": str,
-    "protocol": str,
-    "overrides": dict,
-    "steps": int,
-}
+KINDS = CONDITION | {"overrides": dict, "steps": int}
 
 
 @dataclass(frozen=True)
@@ -46,8 +39,7 @@ class Condition:
     @property
     def columns(self) -> dict[str, Any]:
         """What every row says of its condition."""
-        own = {name: getattr(self, name) for name in ("agent", "env", "delay", "preset", "protocol")}
-        return own | {"delay": self.label}
+        return {name: getattr(self, name) for name in CONDITION} | {"delay": self.label}
 
     @property
     def json(self) -> dict[str, Any]:
@@ -79,17 +71,9 @@ class Setup:
     @property
     def config(self) -> dict[str, Any]:
         """The configuration that a run folder keeps: every option by name, defaults included."""
-        condition = self.condition
-        return {
-            "agent": condition.agent,
-            "preset": condition.preset,
-            "env": condition.env,
-            "delay": condition.delay,
-            "protocol": condition.protocol,
-            "privileged": self.agent.privileged,
-            "hyperparameters": values_of(self.agent),
-            "schedule": values_of(self.schedule),
-        }
+        names = {name: getattr(self.condition, name) for name in CONDITION}
+        options = {"hyperparameters": values_of(self.agent), "schedule": values_of(self.schedule)}
+        return names | {"privileged": self.agent.privileged} | options
 
     def min_episode_steps(self, spec: Spec) -> int:
         """Steps that must follow in an episode before one can be sampled, itself included (see `replay.append`)."""
@@ -101,19 +85,8 @@ class Setup:
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def resolve(
-    agent: str,
-    env: str,
-    delay: float | str | DelayLaw | Channel | Delay,
-    preset: str,
-    protocol: str,
-    overrides: Mapping[str, Any],
-) -> Setup:
-    """Resolve what a user gave into a condition and its objects.
-
-    Raises:
-        DelayRLError: an unknown agent, preset, protocol or option, a bad value, a bad delay.
-    """
+def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, overrides: Mapping[str, Any]) -> Setup:
+    """Resolve what a user gave into a condition and its objects. Raises DelayRLError for what does not exist or fit."""
     registration = find_agent(agent)
     if preset not in registration.presets:
         raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(registration.presets)}")

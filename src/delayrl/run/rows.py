@@ -6,15 +6,11 @@ from typing import Any
 from delayrl.errors import DelayRLError
 
 Row = dict[str, Any]
-EPISODE: dict[str, type] = {
-    "step": int,
-    "policy": str,
-    "episode": int,
-    "reset_seed": int,
-    "return": float,
-    "length": int,
-}
-"""The columns that differ between the rows of a run, with their types. The other columns describe its condition."""
+CONDITION: dict[str, Any] = {"agent": str, "env": str, "delay": int | str, "preset": str, "protocol": str}
+"""The columns that describe a row's condition, with their types."""
+NUMBERS = {"episode": int, "reset_seed": int, "return": float, "length": int}
+EPISODE: dict[str, type] = {"step": int, "policy": str, **NUMBERS}
+"""The columns that differ between the rows of a run, with their types."""
 
 
 def check_row(row: Any, where: object) -> Row:

@@ -60,7 +60,7 @@ class Program:
     ) -> tuple[Learner, Metrics, bool]:
         """Store the newest steps and run the phases that are due at them, without waiting. Donates `learner`.
 
-        `pending` are steps, [steps][seeds], up to number `last`. Nothing is due before step `random_steps`. If the first
+        `pending` are steps, [steps][seeds], up to number `last`. Nothing is due before `random_steps`. If the first
         phase is due at every step, it runs after each is stored; all others run at the end. Returns the new learner,
         its metrics, and whether anything was due.
         """

@@ -11,9 +11,7 @@ class Tracker:
 
     def __init__(self, kind: str | None, path: Path):
         self._write: Any = None
-        if kind is None:
-            return
-        if kind not in ("tensorboard", "wandb"):
+        if kind not in (None, "tensorboard", "wandb"):
             raise DelayRLError(f"track must be tensorboard or wandb; got {kind!r}")
         try:
             if kind == "tensorboard":
@@ -21,7 +19,7 @@ class Tracker:
 
                 writer = SummaryWriter(str(path / "tensorboard"))
                 self._write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
-            else:
+            elif kind == "wandb":
                 import wandb
 
                 run = wandb.init(project="delayrl", name=str(path), dir=str(path), reinit="create_new")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from tqdm import tqdm
 
 from delayrl.agents.base import PRODUCTS, Agent, Schedule, State, template
-from delayrl.delays import Channel, Delay, DelayLaw
+from delayrl.delays import DelayLike
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
@@ -32,7 +32,7 @@ from delayrl.wrappers import Delayed
 def train(
     agent: str,
     env: str,
-    delay: int | str | DelayLaw | Channel | Delay = 0,
+    delay: DelayLike = 0,
     *,
     preset: str = "paper",
     seed: int = 0,
@@ -111,21 +111,15 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
 
 
 def check_fit(agent: Agent, schedule: Schedule, env: Delayed) -> State:
-    """Return the shapes and types of the agent's state on a task.
-
-    Raises:
-        DelayRLError: agent, schedule and delayed task do not fit.
-    """
+    """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
     spec, task = spec_of(env), env.spec
     least = 2 * (spec.delay + agent.ahead(spec)) + 2
     for name in ("replay_capacity", "random_steps"):
         if getattr(schedule, name) < least:
             raise DelayRLError(f"{name} must be at least {least} here; got {getattr(schedule, name)}")
-    if schedule.evaluate_every % schedule.updates_per_call:  # or evaluating would change what is learned
-        raise DelayRLError(
-            f"evaluate_every must be a multiple of updates_per_call; got {schedule.evaluate_every} and "
-            f"{schedule.updates_per_call}"
-        )
+    every, block = schedule.evaluate_every, schedule.updates_per_call
+    if every % block:  # or evaluating would change what is learned
+        raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
     if task is None or task.max_episode_steps is None:
         name = task.id if task else "the task"
         raise DelayRLError(f"{name} has no time limit, so evaluation may never end; register it with one")
@@ -145,8 +139,7 @@ def on_device(name: str | None) -> Iterator[None]:
     try:
         device = jax.devices(name)[0]
     except RuntimeError as error:
-        raise DelayRLError(
-            f"JAX finds no {name}; `pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu"
-        ) from error
+        hint = "`pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu"
+        raise DelayRLError(f"JAX finds no {name}; {hint}") from error
     with jax.default_device(device):
         yield
