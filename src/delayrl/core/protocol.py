@@ -7,24 +7,14 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to train and evaluate. docs/concepts.md compares the two that exist.
+    """One way to train and evaluate. docs/concepts.md compares the two that exist."""
 
-    Attributes:
-        name: as rows and the command line have it.
-        start_states: of training and evaluation episodes: each its own, or the one that the run's seed gives.
-        time_limit: whether the value of the state after it is bootstrapped, or it counts as a termination.
-        first_action: of an episode, if there is a delay: the agent's, or a uniformly random one.
-        last_starts: whether the last steps of an episode, too close to its end for a full n-step target, are learned
-            from or dropped.
-        overrides: hyperparameters of the agent that belong to the protocol.
-    """
-
-    name: str
-    start_states: Literal["own", "same"] = "own"
-    time_limit: Literal["bootstraps", "terminates"] = "bootstraps"
-    first_action: Literal["agent", "random"] = "agent"
-    last_starts: Literal["kept", "dropped"] = "kept"
-    overrides: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # as rows and the command line have it
+    start_states: Literal["own", "same"] = "own"  # each episode's own, or the one that the run's seed gives
+    time_limit: Literal["bootstraps", "terminates"] = "bootstraps"  # what it means for the value of the state after it
+    first_action: Literal["agent", "random"] = "agent"  # whose the first action of an episode is, if there is a delay
+    last_starts: Literal["kept", "dropped"] = "kept"  # steps too close to an episode's end for a full n-step target
+    overrides: Mapping[str, Any] = field(default_factory=dict)  # the agent's hyperparameters that belong to it
 
 
 CORRECTED = Protocol("corrected")
