@@ -35,14 +35,10 @@ class LockedError(Exception):
 
 @contextlib.contextmanager
 def hold(folder: Path, patience: float = 1.0) -> Iterator[None]:
-    """Lock a cell. The operating system releases the lock when the process ends, however it ends.
-
-    Args:
-        folder: the cell's folder.
-        patience: seconds to wait for the lock; `holder` takes it for a moment.
+    """Lock a cell until the block or the process ends, however it ends.
 
     Raises:
-        LockedError: another process holds it.
+        LockedError: another process still holds it after `patience` seconds; `holder` takes it for a moment.
     """
     import fcntl  # POSIX only
 
@@ -67,14 +63,11 @@ def holder(folder: Path) -> str | None:
     """Return the host and process id that hold the cell, or None."""
     import fcntl
 
-    try:
-        with open(folder / "lock") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return file.read().strip() or "another process"
-    except FileNotFoundError:
-        return None
+    with contextlib.suppress(FileNotFoundError), open(folder / "lock") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return file.read().strip() or "another process"
     return None
 
 
@@ -126,40 +119,27 @@ def newest_metrics(run: Path) -> dict[str, Any]:
 
 def prepare(folder: Path, cell: "Cell") -> None:
     """Make the cell's folder and write cell.json. Raises DelayRLError if the disk refuses."""
-    file, text = folder / "cell.json", json.dumps(cell.json | {"id": cell.id}, indent=1)
-    if _text(file) != text:
-        with disk_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            write_file(file, text.encode(), shared=True)
+    _write(folder / "cell.json", json.dumps(cell.json | {"id": cell.id}, indent=1))
 
 
 def claim(runs: Path, grid: "Grid", *, check_only: bool = False) -> None:
-    """Record which file a grid's name stands for. An edited file keeps its name.
-
-    Args:
-        runs: the folder of the cells' folders.
-        grid: the grid whose name is claimed.
-        check_only: write nothing.
+    """Record which file a grid's name stands for; if `check_only`, write nothing. An edited file keeps its name.
 
     Raises:
         DelayRLError: another file with other cells has used the name here.
     """
     file = runs / "grids" / f"{grid.name}.json"
     source = f"delayrl:{grid.name}" if grid.is_shipped else os.path.relpath(grid.source.resolve(), runs.resolve())
-    claimed = {"source": source, "cells": grid.ids}
+    recorded = claimed = {"source": source, "cells": grid.ids}
     with contextlib.suppress(ValueError):
         recorded = json.loads(_text(file))
-        if recorded["source"] != source and recorded["cells"] != grid.ids:
-            raise DelayRLError(
-                f"two grids are named {grid.name!r}: {recorded['source']} (seen from {runs}) has used the name there; "
-                f'give this one another name = "…", or another --runs'
-            )
-        if recorded == claimed:
-            return
+    if recorded["source"] != source and recorded["cells"] != grid.ids:
+        raise DelayRLError(
+            f"two grids are named {grid.name!r}: {recorded['source']} (seen from {runs}) has used the name there; "
+            f'give this one another name = "…", or another --runs'
+        )
     if not check_only:
-        with disk_errors(file.parent):
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_file(file, json.dumps(claimed).encode(), shared=True)
+        _write(file, json.dumps(claimed))
 
 
 def _newest_checkpoint(run: Path) -> Checkpoint | None:
@@ -167,6 +147,14 @@ def _newest_checkpoint(run: Path) -> Checkpoint | None:
         with contextlib.suppress(DelayRLError):
             return read_checkpoint(path)
     return None
+
+
+def _write(file: Path, text: str) -> None:
+    """Write a file and its folder, unless it holds the text already."""
+    if _text(file) != text:
+        with disk_errors(file.parent):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_file(file, text.encode(), shared=True)
 
 
 def _text(file: Path) -> str:

@@ -1,24 +1,4 @@
-"""Grids: expand a TOML file of agents, tasks, delays, seeds and overrides into cells.
-
-```toml
-description = "…"
-preset = "small"                     # and protocol = "corrected" (default) or "official"
-seeds = 3                            # 0, 1, 2; or a list of consecutive seeds
-tasks = ["delayrl/Reacher-v4"]       # top-level keys are the defaults of every product
-
-[overrides]                          # hyperparameters and schedule options of all agents …
-steps = 5_000
-[overrides.vdpo]                     # … and of one agent
-width = 64
-
-[[product]]
-agents = ["vdpo", "bpql"]
-delays = [5, 25]
-
-[[product]]
-agents = ["sac"]
-delays = [0]
-```
+"""Grids: expand a TOML file of agents, tasks, delays, seeds and overrides into cells. docs/experiments.md has the keys.
 
 A cell is one lockstep group of seeds. Its id hashes the resolved configuration, defaults included. So the way a file is
 written does not change ids, and grids that contain the same cell share its results.
@@ -35,7 +15,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from delayrl.agents.registry import AGENTS, find_agent
+from delayrl.agents.registry import find_agent
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
@@ -43,16 +23,8 @@ from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
 from delayrl.training.train import check_fit
 
-PRODUCT = {
-    "agents": list,
-    "tasks": list,
-    "delays": list,
-    "seeds": int | list,
-    "lockstep": int,
-    "preset": str,
-    "protocol": str,
-    "overrides": dict,
-}
+LISTS = {"agents": list, "tasks": list, "delays": list}
+PRODUCT = {**LISTS, "seeds": int | list, "lockstep": int, "preset": str, "protocol": str, "overrides": dict}
 GRID = {**PRODUCT, "name": str, "description": str, "include": list, "product": list}
 DEFAULTS: dict[str, Any] = {"preset": "paper", "protocol": "corrected", "seeds": 1, "overrides": {}}
 
@@ -93,8 +65,7 @@ def load_grid(grid: str | Path) -> Grid:
         DelayRLError: no such grid, invalid TOML, an unknown key, agent, task or hyperparameter, nothing to run, a cell
             that cannot be trained, the same run in two cells.
     """
-    source = _find(str(grid), Path())
-    table = _read(source)
+    source, table = _read(str(grid), Path())
     try:
         cells = _expand(table, source)
         name = table.get("name", source.stem)
@@ -103,25 +74,21 @@ def load_grid(grid: str | Path) -> Grid:
         _check_overlap(cells)
     except DelayRLError as error:
         raise DelayRLError(f"{source.name}: {error}") from error
-    tasks = list(dict.fromkeys(cell.condition.env for _, cell in cells))
+    tasks = [cell.condition.env for _, cell in cells]
     ordered = sorted((cell for _, cell in cells), key=lambda cell: tasks.index(cell.condition.env))  # task by task
     return Grid(name, " ".join(table.get("description", "").split()), source, tuple(ordered))
 
 
-def _find(grid: str, folder: Path) -> Path:
-    if grid.endswith(".toml") or "/" in grid:
-        path = folder / grid
-        if not path.is_file():
-            raise DelayRLError(f"there is no grid file {path}")
-        return path
-    if grid not in shipped():
+def _read(grid: str, folder: Path) -> tuple[Path, dict[str, Any]]:
+    """Return the file of a grid, and what it holds. A path is relative to the folder."""
+    is_path = grid.endswith(".toml") or "/" in grid
+    source = folder / grid if is_path else shipped().get(grid)
+    if source is None:
         raise DelayRLError(f"unknown grid {grid!r}; give a .toml file, or one of {', '.join(shipped())}")
-    return shipped()[grid]
-
-
-def _read(source: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(source.read_text())
+        return source, tomllib.loads(source.read_text())
+    except FileNotFoundError as error:
+        raise DelayRLError(f"there is no grid file {source}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise DelayRLError(f"{source} is not a valid TOML file: {error}") from error
 
@@ -133,18 +100,16 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
         raise DelayRLError(f"{source.name} includes other grids, so it cannot be included")
     cells: list[tuple[Setup, Cell]] = []
     for other in table.get("include", []):
-        path = _find(str(other), source.parent)
-        cells += _expand(_read(path), path, included=True)
-    own = [key for key in ("agents", "tasks", "delays") if key in table]
-    products = table.get("product", [{}] if own or not cells else [])
+        path, included_table = _read(str(other), source.parent)
+        cells += _expand(included_table, path, included=True)
+    products = table.get("product", [{}] if LISTS.keys() & table.keys() or not cells else [])
     if not all(isinstance(item, dict) for item in products):
         raise DelayRLError("products are written as [[product]]")
     shared: dict[str, Any] = DEFAULTS | {key: value for key, value in table.items() if key in PRODUCT}
     for number, item in enumerate(products, 1):
         try:
             _check_keys(item, PRODUCT, "a product")
-            merged = shared | item | {"overrides": _merge(shared["overrides"], item.get("overrides", {}))}
-            cells += _cells(merged)
+            cells += _cells(shared | item | {"overrides": _merge(shared["overrides"], item.get("overrides", {}))})
         except DelayRLError as error:
             raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
     if not cells:
@@ -161,32 +126,27 @@ def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], what: str) -
             raise DelayRLError(f"{key} must be {words.get(known[key], 'a number or a list')}; got {value!r}")
 
 
-def _merge(*tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge overrides; later tables win. The tables of a single agent are merged too."""
-    merged: dict[str, Any] = {}
-    for table in tables:
-        for key, value in table.items():
-            known = merged.get(key, value)
-            if isinstance(known, dict) != isinstance(value, dict):
-                raise DelayRLError(f"overrides: {key} is a table in one place and a value in another")
-            merged[key] = known | value if isinstance(value, dict) else value
+def _merge(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge overrides; a product's own win. The tables of a single agent are merged too."""
+    merged = dict(shared)
+    for key, value in own.items():
+        known = shared.get(key, value)
+        if isinstance(known, dict) != isinstance(value, dict):
+            raise DelayRLError(f"overrides: {key} is a table in one place and a value in another")
+        merged[key] = known | value if isinstance(value, dict) else value
     return merged
 
 
 def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
     """Yield the cells of one product."""
-    for key in ("agents", "tasks", "delays"):
+    for key, kind in (("agents", str), ("tasks", str), ("delays", int | float | str)):
         if not table.get(key):
             raise DelayRLError(f"there are no {key}, so nothing to run")
-    for key, kind in (("agents", str), ("tasks", str), ("delays", int | float | str)):
         for item in table[key]:
             if not isinstance(item, kind) or isinstance(item, bool):
                 raise DelayRLError(f"{key} cannot hold {item!r}")
-    for agent in table["agents"]:
+    for agent in [*table["agents"], *(name for name, value in table["overrides"].items() if isinstance(value, dict))]:
         find_agent(agent)
-    for name, value in table["overrides"].items():
-        if isinstance(value, dict) and name not in AGENTS:
-            find_agent(name)
     shared = {name: value for name, value in table["overrides"].items() if not isinstance(value, dict)}
     groups = _seed_groups(table["seeds"], table.get("lockstep"))
     for env, delay, agent in product(table["tasks"], table["delays"], table["agents"]):

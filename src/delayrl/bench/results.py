@@ -39,11 +39,7 @@ CREATE VIEW results AS
 
 
 def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
-    """Yield the rows of cells from their run folders, each with its cell's id.
-
-    Raises:
-        DelayRLError: a damaged row.
-    """
+    """Yield the rows of cells, each with its cell's id, from run folders. Raises DelayRLError for a damaged row."""
     for cell in cells:
         for path in folders.seed_folders(runs / cell.folder, cell.seeds):
             for row in _read_rows(path):
@@ -101,10 +97,8 @@ def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, la
     first = config.pop("versions", None)
     versions = _distinct(([first] if first else []) + later)
     shared = {k: v for k, v in rows[0].items() if k not in EPISODE and all(row.get(k) == v for row in rows)}
-    run = table.execute(
-        "INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)",
-        (cell.id, seed, _json(shared), _json(config), _json(versions)),
-    ).lastrowid
+    described = (cell.id, seed, _json(shared), _json(config), _json(versions))
+    run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", described).lastrowid
     for row in rows:
         more = {k: v for k, v in row.items() if k not in EPISODE and k not in shared}
         values = (run, *(row[name] for name in EPISODE), _json(more) if more else None)
@@ -141,16 +135,12 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list
         DelayRLError: not a table of ours, a damaged one, or one with another schema version.
     """
     with _open(file) as table:
-        cells = [
-            _stored_cell(*values)
-            for values in table.execute("SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number")
-        ]
-        shared = {
-            run: json.loads(text) | {"cell": cell}
-            for run, cell, text in table.execute("SELECT id, cell, shared FROM runs")
-        }
+        stored = table.execute("SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number")
+        cells = [_stored_cell(*values) for values in stored]
+        runs = table.execute("SELECT id, cell, shared FROM runs")
+        shared = {run: json.loads(text) | {"cell": cell} for run, cell, text in runs}
         rows = [
-            shared[run] | dict(zip(EPISODE, values, strict=True)) | (json.loads(more) if more else {})
+            shared[run] | dict(zip(EPISODE, values, strict=True)) | json.loads(more or "{}")
             for run, more, *values in table.execute(f"SELECT run, more, {', '.join(EPISODE)} FROM rows")
         ]
         versions = [dict(v) for (text,) in table.execute("SELECT versions FROM runs") for v in json.loads(text)]
@@ -177,9 +167,7 @@ def _open(file: Path) -> Iterator[sqlite3.Connection]:
     except (sqlite3.Error, ValueError, KeyError, TypeError, DelayRLError) as error:
         raise DelayRLError(f"{file} is no table of results, or damaged: {error}") from error
     other = version[0] if version else "none"
-    raise DelayRLError(
-        f"{file} has schema version {other}, this program reads {SCHEMA}: collect it again with this version"
-    )
+    raise DelayRLError(f"{file} has schema version {other}, this program reads {SCHEMA}: collect it again")
 
 
 def _json(value: Any) -> str:

@@ -33,38 +33,27 @@ class Backend(Protocol):
 
     def room(self) -> int:
         """Return how many more cells may be started now."""
-        ...
 
     def start(self, cell: Cell) -> None:
         """Start a cell, whose folder is prepared. Raises DelayRLError if that fails."""
-        ...
 
     def ended(self) -> list[tuple[Cell, Outcome]]:
         """Return the cells that ended since the last call."""
-        ...
 
     def stop(self) -> None:
         """Ask all running cells to stop at a checkpoint."""
-        ...
 
     def close(self) -> None:
         """Kill what still runs, and free what was set up for it."""
-        ...
 
 
 @dataclass
 class Completion:
-    """How the cells of a grid ended.
+    """How the cells of a grid ended."""
 
-    Attributes:
-        done: complete cells, those included that were complete before.
-        failed: the first line of the failure, by cell id.
-        unfinished: stopped by the time limit or a signal.
-    """
-
-    done: list[Cell] = field(default_factory=list)
-    failed: dict[str, str] = field(default_factory=dict)
-    unfinished: list[Cell] = field(default_factory=list)
+    done: list[Cell] = field(default_factory=list)  # those included that were complete before
+    failed: dict[str, str] = field(default_factory=dict)  # the first line of the failure, by cell id
+    unfinished: list[Cell] = field(default_factory=list)  # stopped by the time limit or a signal
 
 
 def run_cells(

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from operator import attrgetter
 from pathlib import Path
 from statistics import median
 
@@ -44,10 +45,6 @@ def seconds_left(standing: Standing, workers: int) -> float | None:
 
     A cell that has not begun is taken to be as fast as the median of the cells most like it that have: the same agent,
     task and delay, else the same agent and task, else the same agent, else all.
-
-    Args:
-        standing: how far each cell is.
-        workers: how many cells run at a time.
     """
     measured = [(cell, p.speed) for cell, p in standing if p.speed]
     unfinished = [(cell, p) for cell, p in standing if p.state in ("todo", "running")]
@@ -61,11 +58,8 @@ def seconds_left(standing: Standing, workers: int) -> float | None:
 
 def _speed_like(cell: Cell, measured: list[tuple[Cell, float]]) -> float:
     for names in (("agent", "env", "delay"), ("agent", "env"), ("agent",)):
-        alike = [
-            speed
-            for other, speed in measured
-            if all(getattr(other.condition, name) == getattr(cell.condition, name) for name in names)
-        ]
+        values = attrgetter(*names)
+        alike = [speed for other, speed in measured if values(other.condition) == values(cell.condition)]
         if alike:
             return median(alike)
     return median(speed for _, speed in measured)
@@ -92,20 +86,11 @@ def table(standing: Standing) -> list[list[str]]:
     rows = []
     for cell, p in standing:
         condition, first, last = cell.condition, cell.seeds[0], cell.seeds[-1]
+        names = [cell.id, condition.agent, condition.env, str(condition.label)]
+        seeds, steps = f"{first}-{last}" if last > first else str(first), f"{p.step:,} / {condition.steps:,}"
         left = seconds_left([(cell, p)], 1)
-        rows.append(
-            [
-                cell.id,
-                condition.agent,
-                condition.env,
-                str(condition.label),
-                f"{first}-{last}" if last > first else str(first),
-                p.state,
-                f"{p.step:,} / {condition.steps:,}",
-                f"{p.speed:.0f}" if p.speed else "",
-                duration(left) if left else "",
-            ]
-        )
+        times = [f"{p.speed:.0f}" if p.speed else "", duration(left) if left else ""]
+        rows.append([*names, seeds, p.state, steps, *times])
     return rows
 
 

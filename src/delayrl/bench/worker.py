@@ -37,12 +37,7 @@ def main() -> None:
 
 
 def work(folder: Path, device: str | None = None) -> Outcome:
-    """Lock a cell, then train it or resume it.
-
-    Args:
-        folder: the cell's folder, with its cell.json.
-        device: "cpu" or "gpu"; None leaves the choice to JAX.
-    """
+    """Lock a cell, then train or resume it. Its folder has its cell.json; the device is "cpu", "gpu" or JAX's own."""
     try:
         with hold(folder):
             return _train(folder, json.loads((folder / "cell.json").read_text()), device)
@@ -67,19 +62,9 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
 
     try:
         note(folder, "begun", pid=os.getpid(), step=step, versions=versions())
-        train(
-            cell["agent"],
-            cell["env"],
-            cell["delay"],
-            preset=cell["preset"],
-            protocol=cell["protocol"],
-            seed=seeds[0],
-            seeds=len(seeds),
-            out=folder if len(seeds) > 1 else seed_folders(folder, seeds)[0],
-            device=device,
-            progress=False,
-            **cell["overrides"],
-        )
+        condition = {name: cell[name] for name in ("agent", "env", "delay", "preset", "protocol")} | cell["overrides"]
+        out = folder if len(seeds) > 1 else seed_folders(folder, seeds)[0]
+        train(**condition, seed=seeds[0], seeds=len(seeds), out=out, device=device, progress=False)
         note(folder, "done")
         return Outcome("done", "")
     except StoppedError as error:

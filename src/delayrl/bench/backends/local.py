@@ -53,11 +53,7 @@ class LocalBackend:
 
 
 def start_worker(folder: Path, device: str | None) -> subprocess.Popen[str]:
-    """Start a worker process on a cell. Ctrl-C does not reach it: whoever started it passes the signal on.
-
-    Raises:
-        DelayRLError: the disk or the system refuses.
-    """
+    """Start a worker process, which Ctrl-C does not reach. Raises DelayRLError if the disk or the system refuses."""
     command = [sys.executable, "-m", "delayrl.bench.worker", str(folder), *([device] if device else [])]
     try:
         with open(folder / "worker.log", "w") as log:

@@ -9,7 +9,6 @@ import os
 import platform
 import socket
 import threading
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,12 +34,10 @@ class Supervisor:
         if not (Path(folder) / "cell.json").is_file():
             return Outcome("failed", f"{folder} cannot be seen from {platform.node()}: the nodes must share it")
         process = start_worker(Path(folder), device)
-        stopping = False
         while process.poll() is None:
-            if self._stop.is_set() and not stopping:
+            if self._stop.wait(PAUSE):
                 process.terminate()
-                stopping = True
-            time.sleep(PAUSE)
+                process.wait()
         return read_outcome(process)
 
     def stop(self) -> None:
@@ -50,24 +47,15 @@ class Supervisor:
 
 @dataclass
 class RayBackend:
-    """Runs cells on a Ray cluster.
+    """Runs cells on a Ray cluster."""
 
-    Attributes:
-        runs: the folder of the cells' folders.
-        address: HOST:PORT of the cluster, or "auto"; None starts a local one.
-        workers: the most cells at a time; None leaves the limit to the cluster.
-        cpus, gpus: what each cell takes of them.
-        device: "cpu" or "gpu"; None leaves the choice to JAX.
-        running: each running cell with its actor and its pending answer, by cell id.
-    """
-
-    runs: Path
-    address: str | None = None
-    workers: int | None = None
-    cpus: float = 1.0
-    gpus: float = 0.0
-    device: str | None = None
-    running: dict[str, tuple[Cell, Any, Any]] = field(default_factory=dict)
+    runs: Path  # the folder of the cells' folders
+    address: str | None = None  # HOST:PORT of the cluster, or "auto"; None starts a local one
+    workers: int | None = None  # the most cells at a time; None leaves the limit to the cluster
+    cpus: float = 1.0  # cores for each cell
+    gpus: float = 0.0  # GPUs for each cell
+    device: str | None = None  # "cpu" or "gpu"; None leaves the choice to JAX
+    running: dict[str, tuple[Cell, Any, Any]] = field(default_factory=dict)  # cell, actor, answer
 
     def __post_init__(self) -> None:
         if not (0 <= self.cpus < math.inf and 0 <= self.gpus < math.inf and self.cpus + self.gpus):
@@ -100,15 +88,15 @@ class RayBackend:
     def ended(self) -> list[tuple[Cell, Outcome]]:
         """Return the cells that answered since the last call, and those whose node or actor died."""
         ended = []
-        answers = {answer: cell for cell, _, answer in self.running.values()}
-        ready, _ = self._ray.wait(list(answers), num_returns=len(answers), timeout=0) if answers else ([], [])
-        for answer in ready:
-            cell = answers[answer]
+        for cell, actor, answer in list(self.running.values()):
+            ready, _ = self._ray.wait([answer], timeout=0)
+            if not ready:
+                continue
             try:
                 outcome = Outcome(*self._ray.get(answer))
             except self._ray.exceptions.RayError as error:
                 outcome = Outcome("died", f"{type(error).__name__}: {first_line(error)}")
-            _, actor, _ = self.running.pop(cell.id)
+            del self.running[cell.id]
             self._ray.kill(actor)
             ended.append((cell, outcome))
         return ended
@@ -127,11 +115,7 @@ class RayBackend:
 
 
 def connect(address: str | None) -> Any:
-    """Return the module `ray`, connected to the cluster at an address, or to a new local one.
-
-    Raises:
-        DelayRLError: Ray is not installed, or no cluster answers at the address.
-    """
+    """Return `ray`, connected to a cluster or a new local one. Raises DelayRLError if it is missing or none answers."""
     try:
         import ray
     except ImportError as error:

@@ -19,8 +19,6 @@ from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell
 from delayrl.run.disk import disk_errors
 
-HOUR = 3600.0
-
 SCRIPT = """#!/bin/bash
 #SBATCH --job-name=delayrl-{name}
 #SBATCH --array=0-{last}
@@ -57,22 +55,17 @@ def script(
     options: Sequence[str] = (),
     arguments: Sequence[str] = (),
 ) -> str:
-    """Return the text of an sbatch script.
+    """Return the text of an sbatch script with one element for each cell. The nodes must share the folder `runs`.
 
-    Args:
-        grid: the grid that the cells come from.
-        cells: the cells to run, one for each element of the array.
-        runs: the folder of the cells' folders, on a file system that the nodes share.
-        time_limit: seconds until an element stops and requeues itself (default: an hour).
-        options: options for `#SBATCH` lines, e.g. "--partition=gpu".
-        arguments: more arguments for `delayrl bench run`.
+    An element stops and requeues itself after `time_limit` seconds (default: an hour). `options` go into `#SBATCH`
+    lines, e.g. "--partition=gpu"; `arguments` go to `delayrl bench run`.
 
     Raises:
         DelayRLError: an option that is none.
     """
     source = grid.name if grid.is_shipped else str(grid.source.resolve())
     words = [sys.executable, "-m", "delayrl", "bench", "run", source, "--runs", str(runs.resolve()), *arguments]
-    limit = HOUR if time_limit is None else time_limit
+    limit = time_limit or 3600
     words += ["--time-limit", f"{int(limit)}s"]
     before = int(GRACE) + 30
     for option in options:
