@@ -14,7 +14,6 @@ from delayrl.deploy.latency import ages_of, latency
 from delayrl.envs import tasks
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import Checkpoint, Run
-from delayrl.wrappers.single import seconds_of
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +105,7 @@ def test_a_task_that_says_its_step_by_another_name(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(type(make("delayrl/Counter-v0").unwrapped), "tau", 0.04, raising=False)
     run = run_of(tmp_path / "run", "a-sac", "delayrl/Counter-v0", 2, (2, 1))
     assert export_run(run.path, tmp_path / "bundle")["dt"] == 0.04
-    assert next(seconds_of(env) for name, env in tasks() if name == "delayrl/Counter-v0") == 0.04
+    assert next(seconds for name, _, seconds in tasks() if name == "delayrl/Counter-v0") == 0.04
 
 
 def test_the_delay_of_actions_comes_along(tmp_path: Path) -> None:

@@ -5,10 +5,6 @@ import argparse
 from delayrl.cli.console import print_table
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add nothing: the command has no options."""
-
-
 def run(given: argparse.Namespace | None = None) -> None:
     """Print a table of the agents."""
     from delayrl.agents.registry import AGENTS

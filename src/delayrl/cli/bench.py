@@ -3,13 +3,13 @@
 import argparse
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
-from delayrl.bench.status import HEAD, Standing, closing_lines, duration, line, standing, status, table
+from delayrl.bench.status import HEAD, closing_lines, duration, line, standing, status, table
 from delayrl.cli.console import StatusLine, print_table
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell
@@ -29,9 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     def add_command(name: str, text: str) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("grid", metavar="GRID", help=f"a .toml file, or one of {', '.join(shipped())}")
-        command.add_argument(
-            "--runs", type=Path, default=Path("runs/bench"), help="folder of the cells (default: runs/bench)"
-        )
+        command.add_argument("--runs", type=Path, default="runs/bench", help="the cells' folder (default: runs/bench)")
         return command
 
     add_command("plan", "list the cells of a grid, and which are done")
@@ -49,34 +47,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--address", help="ray: HOST:PORT of a cluster, or auto (default: a local one)")
     add("--cpus", type=float, help="ray: cores for each cell (default: 1)")
     add("--gpus", type=float, help="ray: GPUs for each cell (default: 0)")
-    add_command("status", "show progress, speed, time left and failures").add_argument(
-        "--workers", type=int, default=1, metavar="N", help="cells at a time, for the time left (default: 1)"
-    )
-    add_command("collect", "write the rows of a grid into one SQLite table").add_argument(
-        "--out", type=Path, help="the table (default: GRID.sqlite in the folder of the cells)"
-    )
-    add_command("report", "write tables, curves and one HTML page of the results so far").add_argument(
-        "--out", type=Path, metavar="DIR", help="a folder (default: GRID-report in the folder of the cells)"
-    )
+    add = add_command("status", "show progress, speed, time left and failures").add_argument
+    add("--workers", type=int, default=1, metavar="N", help="cells at a time, for the time left (default: 1)")
+    add = add_command("collect", "write the rows of a grid into one SQLite table").add_argument
+    add("--out", type=Path, help="the table (default: GRID.sqlite in the folder of the cells)")
+    add = add_command("report", "write tables, curves and one HTML page of the results so far").add_argument
+    add("--out", type=Path, metavar="DIR", help="a folder (default: GRID-report in the folder of the cells)")
 
 
 def run(given: argparse.Namespace) -> None:
     """Run a command on a grid."""
     if given.action == "report" and given.grid.endswith(".sqlite"):
-        _report_table(Path(given.grid), given.out)
+        _report(None, given)
         return
     grid = load_grid(given.grid)
     if given.action != "plan":
         folders.claim(given.runs, grid, check_only=True)
-    actions = {"plan": _plan, "run": _run, "status": _status, "collect": _collect, "report": _report}
-    actions[given.action](grid, given)
+    {"plan": _plan, "run": _run, "status": _status, "collect": _collect, "report": _report}[given.action](grid, given)
 
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:
     for cell in grid.cells:
-        condition = cell.condition
-        text = f"{cell}, preset {condition.preset}, {condition.steps:,} steps"
-        print(f"{cell.id}  {status(cell, given.runs):<7}  {text}")
+        state, condition = f"{cell.id}  {status(cell, given.runs):<7}", cell.condition
+        print(f"{state}  {cell}, preset {condition.preset}, {condition.steps:,} steps")
     runs = sum(len(cell.seeds) for cell in grid.cells)
     steps = sum(cell.condition.steps * len(cell.seeds) for cell in grid.cells)
     print(f"\n{grid.name}: {len(grid.cells)} cells, {runs} runs, {steps:,} steps")
@@ -100,27 +93,19 @@ def _collect(grid: Grid, given: argparse.Namespace) -> None:
     print(f"{out}: {count:,} rows; {done} of {len(grid.cells)} cells are done")
 
 
-def _report(grid: Grid, given: argparse.Namespace) -> None:
-    from delayrl.bench.results import rows_of, versions_of
-
-    out = given.out or given.runs / f"{grid.name}-report"
-    rows, versions = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
-    _write_report(rows, standing(grid.cells, given.runs), out, grid.name, versions)
-
-
-def _report_table(file: Path, out: Path | None) -> None:
-    from delayrl.bench.results import read_table
-
-    rows, cells, versions = read_table(file)
-    _write_report(rows, cells, out or file.with_name(f"{file.stem}-report"), file.stem, versions)
-
-
-def _write_report(
-    rows: Iterable[dict[str, Any]], cells: Standing, out: Path, title: str, versions: list[dict[str, Any]]
-) -> None:
+def _report(grid: Grid | None, given: argparse.Namespace) -> None:
+    """Report a grid, or the table in the file that was named instead of one."""
+    from delayrl.bench.results import read_table, rows_of, versions_of
     from delayrl.report.report import report
 
-    page = report(rows, cells, out, title, versions)
+    rows: Any
+    if grid is None:
+        folder, name = Path(given.grid).parent, Path(given.grid).stem
+        rows, cells, versions = read_table(Path(given.grid))
+    else:
+        folder, name, cells = given.runs, grid.name, standing(grid.cells, given.runs)
+        rows, versions = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
+    page = report(rows, cells, given.out or folder / f"{name}-report", name, versions)
     print(f"open {page}; the same as Markdown is beside it")
 
 
@@ -138,16 +123,8 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     backend, workers = _backend(given)
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
     with stop_signal() as stop:
-        completion = run_cells(
-            cells,
-            given.runs,
-            backend,
-            tries=given.tries,
-            time_limit=given.time_limit,
-            stop=stop,
-            say=status_line.say,
-            tick=status_line.update,
-        )
+        tries, limit, say, tick = given.tries, given.time_limit, status_line.say, status_line.update
+        completion = run_cells(cells, given.runs, backend, tries=tries, time_limit=limit, stop=stop, say=say, tick=tick)
     status_line.clear()
     print(f"{grid.name}: {len(completion.done)} of {len(cells)} cells done")
     if completion.failed:
@@ -209,8 +186,8 @@ def _check_at_least_one(name: str, value: int | None) -> None:
 def seconds(text: str) -> float:
     """Return the seconds of a time such as 90s, 9m, 1h30m or 2d. Raises DelayRLError for another text."""
     match = re.fullmatch(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
-    units = (86400, 3600, 60, 1)
-    total = sum(int(n or 0) * unit for n, unit in zip(match.groups(), units, strict=True)) if match else 0
+    days, hours, minutes, rest = (int(part or 0) for part in match.groups()) if match else (0, 0, 0, 0)
+    total = 86400 * days + 3600 * hours + 60 * minutes + rest
     if not total:
         raise DelayRLError(f"a time is written as 90s, 9m, 1h30m or 2d, and is above 0; got {text!r}")
     return total

@@ -1,9 +1,31 @@
-"""Tables and a status line for people who read a terminal or a log."""
+"""What commands share: a parser with errors in one line, tables, and a status line for a terminal or a log."""
 
+import argparse
+import difflib
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NoReturn
+
+from delayrl.errors import DelayRLError
+
+
+class Parser(argparse.ArgumentParser):
+    """Parse a command's words. Every error is a DelayRLError."""
+
+    def read(self, words: Sequence[str]) -> argparse.Namespace:
+        """Return the values of the options. The error for an unknown one names the nearest."""
+        given, rest = self.parse_known_args(words)
+        if rest:
+            unknown = next((word for word in rest if word.startswith("--")), "").split("=")[0]
+            near = difflib.get_close_matches(unknown, self._option_string_actions, n=3, cutoff=0.4)
+            hint = f"; did you mean {', '.join(near)}?" if near else ""
+            self.error(f"unexpected {' '.join(rest)!r}{hint}")
+        return given
+
+    def error(self, message: str) -> NoReturn:
+        """Raise DelayRLError instead of printing the usage."""
+        raise DelayRLError(f"{message.replace('argument ', '')} (see `{self.prog} --help`)")
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
@@ -15,15 +37,10 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 class StatusLine:
-    """A line on stderr: rewritten every second on a terminal, repeated every 30 seconds in a log.
-
-    Args:
-        text: returns the line, from the seconds since the start.
-    """
+    """Show what `text` makes of the seconds since the start: each second on a terminal, every 30 seconds in a log."""
 
     def __init__(self, text: Callable[[float], str]):
-        self._text = text
-        self._terminal = sys.stderr.isatty()
+        self._text, self._terminal = text, sys.stderr.isatty()
         self._next, self._start = 0.0, time.monotonic()
 
     def say(self, text: str) -> None:

@@ -31,10 +31,8 @@ def run(given: argparse.Namespace) -> None:
     if given.json:
         print(json.dumps(result))
         return
-    print(
-        f"{result['agent']} on {result['env']}, delay {result['delay']}: return {result['mean_return']:.1f} "
-        f"± {result['std_return']:.1f} over {result['episodes']} episodes"
-    )
+    returns = f"return {result['mean_return']:.1f} ± {result['std_return']:.1f} over {result['episodes']} episodes"
+    print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}")
 
 
 def _sweep(given: argparse.Namespace) -> None:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the run folder and the folder of the bundle."""
-    add = parser.add_argument
-    add("run", type=Path, help="the run folder")
-    add("--out", type=Path, required=True, metavar="DIR", help="a new folder")
-    add("--force", action="store_true", help="replace an existing bundle")
+    parser.add_argument("run", type=Path, help="the run folder")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    parser.add_argument("--force", action="store_true", help="replace an existing bundle")
 
 
 def run(given: argparse.Namespace) -> None:

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from delayrl.cli.parser import Parser
+from delayrl.cli.console import Parser
 from delayrl.errors import DelayRLError
 
 COMMANDS = {
@@ -21,15 +21,11 @@ COMMANDS = {
     "agents": "list the agents",
     "tasks": "list the tasks",
 }
-"""Each command is the module of its name in this folder, with `add_options(parser)` and `run(given)`."""
+"""Each command is the module of its name in this folder, with `run(given)` and, if it has options, `add_options`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command.
-
-    Args:
-        arguments: the words after `delayrl`; None for those of the process.
-    """
+    """Run the command that the words after `delayrl` name; None for the words of the process."""
     try:
         _run(list(sys.argv[1:] if arguments is None else arguments))
     except DelayRLError as error:
@@ -55,6 +51,6 @@ def _run(arguments: list[str]) -> None:
     command = import_module(f"delayrl.cli.{name}")
     if name == "train":  # its options depend on the agent and the preset
         command.add_options(parsers[name], words)
-    else:
+    elif hasattr(command, "add_options"):
         command.add_options(parsers[name])
     command.run(parsers[name].read(words))

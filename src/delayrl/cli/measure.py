@@ -6,8 +6,11 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from delayrl.errors import DelayRLError, first_line
 from delayrl.measure.log import Estimated, from_log, plot
@@ -15,9 +18,7 @@ from delayrl.measure.probing import Counts, Probed, probe
 from delayrl.measure.pushes import Env
 from delayrl.measure.reading import UNITS
 
-SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq")
 COLUMNS = ("time", "commands", "observations", "episode", "stamp", "received")
-LOG_OPTIONS = ("period", *COLUMNS, "unit", "warm_up", "plot", "save")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -27,10 +28,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--json", action="store_true", help="print one JSON object")
     add("--seed", type=int, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
     add("--longest", metavar="N|TIME", help="the longest delay to look for: steps (200), or time (100 rows of the log)")
-    probing = parser.add_argument_group("environment")
-    probing.add_argument("--episodes", type=int, help="number of episodes (default: 8)")
-    log = parser.add_argument_group("log")
-    add = log.add_argument
+    parser.add_argument_group("environment").add_argument("--episodes", type=int, help="episodes to play (default: 8)")
+    add = parser.add_argument_group("log").add_argument
     add("--period", metavar="TIME", help="control period, e.g. 20ms or 50Hz (default: the spacing of the rows)")
     add("--time", metavar="NAME", help="column of the time stamps (default: time, timestamp or t)")
     add("--commands", metavar="NAME", nargs="+", help="columns, or how they begin (default: command, cmd, action)")
@@ -46,35 +45,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> None:
     """Measure the delay and print it."""
-    if is_log(given.target):
+    path = Path(given.target)
+    if path.is_file() or path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
         _refuse(given, ("episodes",), "an environment", "a log")
-        result = from_log(
-            given.target,
-            seconds("period", given.period),
-            **{name: getattr(given, name) for name in COLUMNS},
-            unit=given.unit or "s",
-            longest=seconds("longest", given.longest),
-            warm_up=seconds("warm-up", given.warm_up),
-            seed=given.seed,
-        )
+        columns = {name: getattr(given, name) for name in COLUMNS}
+        times: dict[str, Any] = {name: seconds(name, getattr(given, name)) for name in ("period", "longest", "warm_up")}
+        result = from_log(given.target, **columns, **times, unit=given.unit or "s", seed=given.seed)
         if given.plot:
             plot(result, given.plot)
         if given.save:
             result.save(given.save)
         print(json.dumps(result.json()) if given.json else _show_log(result, given.save))
         return
-    _refuse(given, LOG_OPTIONS, "a log", "an environment")
+    _refuse(given, ("period", *COLUMNS, "unit", "warm_up", "plot", "save"), "a log", "an environment")
     longest = given.longest or "200"
     if not longest.isdecimal():
         raise DelayRLError(f"--longest counts steps of an environment; got {longest!r}")
     episodes = 8 if given.episodes is None else given.episodes
-    probed = probe(find_task(given.target), episodes, given.seed, int(longest), _bar)
+    bar = partial(tqdm, desc="pushing", unit="episode", leave=False, disable=None)  # None: only on a terminal
+    probed = probe(find_task(given.target), episodes, given.seed, int(longest), bar)
     print(json.dumps(probed.json()) if given.json else _show_environment(probed))
-
-
-def is_log(target: str) -> bool:
-    """Whether a target is a file, or has the name of a log."""
-    return Path(target).suffix.lower() in SUFFIXES or Path(target).is_file()
 
 
 def find_task(target: str) -> str | Callable[[], Env]:
@@ -106,7 +96,7 @@ def seconds(name: str, text: str | None) -> float | None:
     if match and match[2] == "hz" and value > 0:
         return 1 / value
     if not match or match[2] == "hz":
-        raise DelayRLError(f"--{name} is a time such as 20ms, 0.02s or 50Hz; got {text!r}")
+        raise DelayRLError(f"--{name.replace('_', '-')} is a time such as 20ms, 0.02s or 50Hz; got {text!r}")
     return value * UNITS[match[2] or "s"]
 
 
@@ -119,8 +109,7 @@ def _show_environment(p: Probed) -> str:
     if p.lost > 0:
         lines.append(f"{p.lost:.0%} of the actions changed nothing: held, overtaken or without effect where they came.")
     if p.echoes:
-        echoes = _ranges(p.echoes)
-        lines.append(f"Components {echoes} of the observation repeat the action itself; they are not counted.")
+        lines += [f"Components {_ranges(p.echoes)} of the observation repeat the action itself; they are not counted."]
     components: dict[int, list[int]] = {}
     for component, steps in enumerate(p.components):
         if steps is not None:
@@ -161,9 +150,8 @@ def _show_stamps(e: Estimated) -> list[str]:
     if e.slowest_warm_up is not None:
         lines.append(f"{'during the warm-up':<26}{_ms(e.slowest_warm_up)} at worst; not counted")
     lines.append(f"{'in steps of ' + _ms(e.period):<26}" + _shares(e.counts))
-    lines.append(
-        "Exact if one clock gave both stamps: an offset between two clocks is in every delay, and cannot be seen."
-    )
+    note = "Exact if one clock gave both stamps: an offset between two clocks is in every delay, and cannot be seen."
+    lines.append(note)
     if e.drift is not None and abs(e.drift) > 200:
         lines.append(f"The smallest delays change by {e.drift:.0f} parts per million: the clocks may run apart.")
     return lines
@@ -184,9 +172,7 @@ def _show_correlation(e: Estimated) -> list[str]:
     shares = f"; parts: {_shares(e.counts)}" if len(e.counts) > 1 else ""
     lines.append(f"{'in steps of ' + _ms(e.period):<26}{e.step}{shares}")
     if e.high - e.low > 4.5 * e.row:
-        lines.append(
-            "The log does not settle it: the interval is wide. --plot shows what else is there; log more rows."
-        )
+        lines += ["The log does not settle it: the interval is wide. --plot shows what else is there; log more rows."]
     if e.row > 0.6 * e.period:
         lines.append("Rows are as far apart as steps: up to one step more cannot be seen. Log faster to see it.")
     return lines
@@ -223,12 +209,3 @@ def _refuse(given: argparse.Namespace, names: tuple[str, ...], of: str, target: 
     for name in names:
         if getattr(given, name) is not None:
             raise DelayRLError(f"--{name.replace('_', '-')} is an option of {of}; {given.target} is taken for {target}")
-
-
-def _bar(episodes: Iterable[int]) -> Iterable[int]:
-    if not sys.stderr.isatty():
-        return episodes
-    from tqdm import tqdm
-
-    bar: Any = tqdm(episodes, desc="pushing", unit="episode", leave=False)
-    return bar

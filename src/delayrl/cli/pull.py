@@ -6,11 +6,10 @@ from pathlib import Path
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the repository and the folder of the bundle."""
-    add = parser.add_argument
-    add("repo", help="OWNER/NAME")
-    add("--out", type=Path, required=True, metavar="DIR", help="a new folder")
-    add("--revision", help="a branch, tag or commit")
-    add("--force", action="store_true", help="replace an existing bundle")
+    parser.add_argument("repo", help="OWNER/NAME")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    parser.add_argument("--revision", help="a branch, tag or commit")
+    parser.add_argument("--force", action="store_true", help="replace an existing bundle")
 
 
 def run(given: argparse.Namespace) -> None:

@@ -5,18 +5,13 @@ import argparse
 from delayrl.cli.console import print_table
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add nothing: the command has no options."""
-
-
 def run(given: argparse.Namespace) -> None:
     """Print a table of the tasks."""
     from delayrl.envs import tasks
-    from delayrl.wrappers.single import seconds_of
 
     rows = []
-    for name, env in tasks():
-        actions, seconds = env.action_space, seconds_of(env)
+    for name, env, seconds in tasks():
+        actions = env.action_space
         sizes = [env.observation_space.shape[0], actions.shape[0], f"±{actions.high.max():g}"]
         rows.append([name, *sizes, env.spec.max_episode_steps or "-", f"{seconds:g}" if seconds else "-"])
     print_table(["task", "observation", "action", "range", "time limit", "seconds a step"], rows)

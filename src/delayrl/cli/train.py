@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from delayrl.cli import agents
-from delayrl.cli.parser import Parser
+from delayrl.cli.console import Parser
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import Run
 
@@ -38,8 +38,7 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     add("--out", type=Path, metavar="DIR", help="the run folder (default: below runs/)")
     add("--device", choices=["cpu", "gpu"], help="where to compute (default: JAX's choice)")
     add("--overwrite", action="store_true", help="start afresh where a run exists")
-    protocols = ["corrected", "official"]
-    add("--protocol", choices=protocols, default="corrected", help="official: as the released code does")
+    add("--protocol", choices=["corrected", "official"], default="corrected", help="official: like the released code")
     add("--track", choices=["tensorboard", "wandb"], help="log to this service as well")
     add("--threads", type=int, default=1, help="threads that step the environments (default: 1)")
     add("--quiet", action="store_true", help="show no progress bar and no notes")

@@ -105,11 +105,11 @@ def quiet() -> Iterator[None]:
         mujoco.set_mju_user_warning(None)
 
 
-def tasks() -> Iterator[tuple[str, Any]]:
-    """Make the papers' nine tasks, small ones to try things on, and ours, each with its id. Closes them after use."""
+def tasks() -> Iterator[tuple[str, Any, float | None]]:
+    """Make the papers' nine tasks, small ones to try, and ours. Yields id, task and seconds of a step; closes each."""
     small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
     ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
     for name in [f"{task}-v5" for task in paper.TASKS] + small + ours:
         env = make(name)
-        yield name, env
+        yield name, env, seconds_of(env)
         env.close()
