@@ -52,11 +52,7 @@ class ADSAC:
 
     learner: sac.SAC = field(default_factory=lambda: sac.SAC(actor_sees="augmented", critic_sees="augmented"))
     auxiliary_delay: Annotated[int, "τ: the delay for which values are learned, at most the task's"] = 0
-    behaviour: Annotated[
-        Behaviour,
-        "who acts in training: of both actors' samples the one with the lower Q (where auxiliary_delay is 0), "
-        "or the augmented actor",
-    ] = "lower-q"
+    behaviour: Annotated[Behaviour, "who acts in training: the sample with the lower Q (τ = 0), or that"] = "lower-q"
     evaluation: Annotated[Literal["mode", "sample"], "which action is evaluated; the released code samples"] = "mode"
 
     @property

@@ -70,10 +70,7 @@ class SAC:
     n_steps: Annotated[int, "longest k of the k-step targets; k is drawn from 1..n_steps"] = 3
     actor_every: Annotated[int, "critic updates between two rounds of actor updates"] = 2
     actor_updates: Annotated[int, "actor updates in a round"] = 2
-    log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (
-        -5.0,
-        2.0,
-    )
+    log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-5.0, 2.0)
     log_std_bounds: Annotated[LogStdBounds, "how it is kept there"] = "rescale"
     batch_size: Annotated[int, "windows in a batch"] = 256
     update_every: Annotated[int, "environment steps between two rounds of updates"] = 1

@@ -67,10 +67,7 @@ class VDPO:
     clone_every: Annotated[int, "environment steps between two rounds of cloning"] = 1000
     clone_updates: Annotated[int, "KL updates in a round, each on a fresh batch"] = 1000
     direction: Annotated[Direction, "KL(delayed‖reference), or forward: KL(reference‖delayed)"] = "reverse"
-    behaviour: Annotated[
-        Behaviour,
-        "who acts in training: of both policies' samples the one with the lower Q, one of them, or a coin flip",
-    ] = "lower-q"
+    behaviour: Annotated[Behaviour, "who acts in training: the sample with the lower Q, or what is named"] = "lower-q"
 
     @property
     def privileged(self) -> bool:

@@ -80,29 +80,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class _Listed:
-    """A law with a list of possible delays, and with the text of the function below that made it, if one did."""
-
-    steps: tuple[int, ...]
-    name: str = field(default="", compare=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        if not self.steps:
-            raise DelayRLError("a law of delays needs at least one delay; it has none")
-        object.__setattr__(self, "steps", tuple(whole_steps(steps) for steps in self.steps))
-
-    @property
-    def maximum(self) -> int:
-        """The longest possible delay, even if its probability is 0."""
-        return max(self.steps)
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, steps=tuple(s + steps for s in self.steps), name="")
-
-
-@dataclass(frozen=True)
-class Choice(_Listed):
+class Choice:
     """Draw each delay independently from a finite distribution.
 
     Attributes:
@@ -110,17 +88,28 @@ class Choice(_Listed):
         probabilities: the probability of each delay; they sum to 1.
     """
 
+    steps: tuple[int, ...]
     probabilities: tuple[float, ...]
+    name: str = field(default="", compare=False)  # its text, if one of the functions below made it
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        object.__setattr__(self, "steps", _delays(self.steps))
         object.__setattr__(self, "probabilities", _distribution(self.probabilities))
         if len(self.steps) != len(self.probabilities):
             raise DelayRLError(f"{len(self.steps)} delays need as many probabilities; got {len(self.probabilities)}")
 
+    @property
+    def maximum(self) -> int:
+        """The longest possible delay, even if its probability is 0."""
+        return max(self.steps)
+
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw one of the delays; the state stays 0."""
         return self.steps[bisect_right(self._cumulative, random.random())], state
+
+    def shifted(self, steps: int) -> Self:
+        """Return the law whose delays are longer by `steps`."""
+        return replace(self, steps=tuple(s + steps for s in self.steps), name="")
 
     @cached_property
     def _cumulative(self) -> list[float]:
@@ -132,7 +121,7 @@ class Choice(_Listed):
 
 
 @dataclass(frozen=True)
-class Markov(_Listed):
+class Markov:
     """A Markov chain with a delay for each of its states. It moves once per message.
 
     Attributes:
@@ -140,15 +129,22 @@ class Markov(_Listed):
         transitions: row i holds the probabilities of the states that follow state i.
     """
 
+    steps: tuple[int, ...]
     transitions: tuple[tuple[float, ...], ...]
+    name: str = field(default="", compare=False)  # its text, if one of the functions below made it
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        object.__setattr__(self, "steps", _delays(self.steps))
         size = len(self.steps)
         _check_states(size)
         object.__setattr__(self, "transitions", tuple(_distribution(row) for row in self.transitions))
         if len(self.transitions) != size or any(len(row) != size for row in self.transitions):
             raise DelayRLError(f"{size} states need a square table: {size} rows of {size} probabilities")
+
+    @property
+    def maximum(self) -> int:
+        """The longest possible delay, even if its probability is 0."""
+        return max(self.steps)
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw the next state of the chain; the first comes from the stationary distribution.
@@ -157,6 +153,10 @@ class Markov(_Listed):
         """
         chain_state = bisect_right(self._cumulative[state], random.random())
         return self.steps[chain_state], chain_state + 1
+
+    def shifted(self, steps: int) -> Self:
+        """Return the law whose delays are longer by `steps`."""
+        return replace(self, steps=tuple(s + steps for s in self.steps), name="")
 
     @cached_property
     def stationary(self) -> tuple[float, ...]:
@@ -180,13 +180,27 @@ class Markov(_Listed):
 
 
 @dataclass(frozen=True)
-class Recorded(_Listed):
+class Recorded:
     """Replay measured delays in order. Each episode starts at a random one; after the last comes the first."""
+
+    steps: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "steps", _delays(self.steps))
+
+    @property
+    def maximum(self) -> int:
+        """The longest delay that was recorded."""
+        return max(self.steps)
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Return the next recorded delay; the state is 1 plus its index."""
         index = state % len(self.steps) if state else int(random.integers(len(self.steps)))
         return self.steps[index], index + 1
+
+    def shifted(self, steps: int) -> Self:
+        """Return the law whose delays are longer by `steps`."""
+        return replace(self, steps=tuple(s + steps for s in self.steps))
 
     def __str__(self) -> str:
         return f"recorded:{','.join(map(str, self.steps))},"
@@ -245,6 +259,12 @@ def random_walk(maximum: int, move: float = 2 / 3) -> Markov:
 def _check_states(count: int) -> None:
     if not 0 < count <= MOST_STATES:
         raise DelayRLError(f"a Markov chain of delays has 1 to {MOST_STATES} states; got {count}")
+
+
+def _delays(steps: tuple[int, ...]) -> tuple[int, ...]:
+    if not steps:
+        raise DelayRLError("a law of delays needs at least one delay; it has none")
+    return tuple(whole_steps(delay) for delay in steps)
 
 
 def _positive(number: float, what: str) -> float:
