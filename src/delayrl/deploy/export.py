@@ -9,13 +9,12 @@ import safetensors.numpy
 from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.backends.onnx_graph import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
-from delayrl.envs import make
+from delayrl.envs import make, seconds_of
 from delayrl.play.policy import Policy, restored
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.run.rows import check_row
-from delayrl.wrappers.single import seconds_of
 
 
 def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError, first_line
 from delayrl.wrappers import Delayed, check_spaces
-from delayrl.wrappers.single import seconds_of
+from delayrl.wrappers.single import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
 
 probe.register()
