@@ -12,7 +12,6 @@ The null distribution comes from the same signals, shifted by more than the long
 has the accuracy of this and of simpler methods, on plants with a known delay.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -119,13 +118,6 @@ def onset(c: Correlation) -> int | None:
     significance, share = strength(c)
     lags = np.flatnonzero((significance > 1) & (share > SHARE)) + 1
     return int(lags[0]) if lags.size else None
-
-
-def resampled(sums: Array, size: int, longest: int, times: int, random: np.random.Generator) -> Iterator[Correlation]:
-    """Yield the correlations of a block bootstrap: over blocks drawn with replacement."""
-    for _ in range(times):
-        weights = np.bincount(random.integers(0, len(sums), len(sums)), minlength=len(sums)).astype(float)
-        yield correlation(sums, size, longest, weights)
 
 
 def peak(r: Array) -> tuple[float, float]:

@@ -209,9 +209,12 @@ def _correlated(
             f"{path}: no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance. "
             "A longer log, other columns, or commands with some random variation may show one"
         )
-    random = np.random.default_rng(seed)
-    onsets = [correlate.onset(c) for c in correlate.resampled(sums, size, lags, RESAMPLINGS, random)]
-    dead_times = [(lag - 1) * row for lag in onsets if lag is not None]
+    random, dead_times = np.random.default_rng(seed), []
+    for _ in range(RESAMPLINGS):  # blocks are drawn with replacement
+        weights = np.bincount(random.integers(0, blocks, blocks), minlength=blocks).astype(float)
+        lag = correlate.onset(correlate.correlation(sums, size, lags, weights))
+        if lag is not None:
+            dead_times.append((lag - 1) * row)
     low, high = np.quantile(dead_times, (0.025, 0.975)) if dead_times else (0.0, lags * row)
     low, high = max(0.0, low - row), high + row  # the log does not show what happens between two rows
     windows, count = [], min(WINDOWS, rows // WINDOW_ROWS)

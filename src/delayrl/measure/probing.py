@@ -13,6 +13,7 @@ that `step(a)` returns reacts to that a.
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from typing import Any
 
 import gymnasium as gym
@@ -101,15 +102,9 @@ def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Ite
     while steps < delay + SPARE:
         steps = delay + SPARE
         pushes = [push(env, seed + e, scale, steps) for e in wrap(range(episodes))]
-        ages = [_total(p.obs) for p in pushes]
+        ages = [_total(p) for p in pushes]
         delay = min(max(delay, *(int(age.max()) for age in ages)), longest)  # random delays may exceed the first
-    return _gather(name, pushes, ages, delay, steps, episodes, seed, scale)
-
-
-def _gather(
-    name: str, pushes: list[Pushes], ages: list[Array], oldest: int, steps: int, episodes: int, seed: int, scale: float
-) -> Probed:
-    oldest = max((int(age.max()) for age in ages if (age >= 0).any()), default=oldest)
+    oldest = max((int(age.max()) for age in ages if (age >= 0).any()), default=delay)
     total = _count_ages(ages, oldest)
     reaction = _count(d for p in pushes for d in _settled(p, "obs", oldest))
     if not total and not reaction:
@@ -122,9 +117,8 @@ def _gather(
     if channel:
         action = _count(d for p in pushes for d in _settled(p, channel, oldest))
         observation = _count_ages([_shown(p.obs, p.channel(channel)) for p in pushes], oldest)
-    echo = np.any([p.echo.any(0) for p in pushes], axis=0)
-    steps_to = [np.where(p.components > 0, p.components - 1 - np.arange(len(p.obs))[:, None], -1) for p in pushes]
-    reactions = np.concatenate(steps_to)
+    echo = np.concatenate([p.echo for p in pushes]).any(0)
+    reactions = np.concatenate([p.components - 1 - np.arange(len(p.obs))[:, None] for p in pushes])  # negative if none
     fewest = np.where(reactions >= 0, reactions, np.iinfo(int).max).min(0)
     return Probed(
         environment=name,
@@ -146,7 +140,7 @@ def _gather(
 def _scout(env: Env, name: str, seed: int, longest: int) -> tuple[float, int]:
     """Return a scale whose effect shows before the episode ends, and the rough delay of that effect, in steps."""
     steps = longest + SCOUTS
-    best: tuple[int, float, int] | None = None
+    seen: list[tuple[int, float, int]] = []
     played = 0
     for scale in SCALES:
         for start in range(seed, seed + STARTS):
@@ -162,15 +156,14 @@ def _scout(env: Env, name: str, seed: int, longest: int) -> tuple[float, int]:
                 spare = followed - delay - SPARE
                 if spare >= 0:
                     return scale, delay
-                if best is None or spare > best[0]:
-                    best = spare, scale, delay
-    if best is None:
+                seen.append((spare, scale, delay))
+    if not seen:
         ended = "" if played == steps else f" (no episode was longer than {played} steps)"
         raise DelayRLError(
             f"{name}: no observation reacted to an action within {min(played, longest)} steps{ended}: the delay is "
             "longer, or observations do not depend on actions"
         )
-    return best[1], best[2]
+    return max(seen, key=itemgetter(0))[1:]
 
 
 def _check_repeats(name: str, played: Rollout, again: Rollout) -> None:
@@ -179,7 +172,7 @@ def _check_repeats(name: str, played: Rollout, again: Rollout) -> None:
     for a, b in ((played.obs, again.obs), (played.state, again.state), (played.rest, again.rest)):
         same &= ~differs(a[:length], b[:length]).any(1)
     if not same.all() or len(played.obs) != len(again.obs):
-        step = int(np.argmin(same)) if not same.all() else length
+        step = int(np.argmin([*same, False]))
         raise DelayRLError(
             f"{name} does not repeat itself: two roll-outs with the same seed and actions differ at step {step}. "
             "Let reset(seed=…) fix all random numbers (sample them from self.np_random, in wrappers too), or probe it "
@@ -198,16 +191,9 @@ def _action_channel(pushes: list[Pushes]) -> tuple[str, str]:
     return "nothing: no state is visible and rewards do not react before observations", ""
 
 
-def _total(effect: Array) -> Array:
+def _total(pushes: Pushes) -> Array:
     """Return the age at each step of the newest action with an effect, [T+1]; -1 if unknown."""
-    count, length = effect.shape
-    ages = np.full(length, -1)
-    for t in range(1, min(length, count + 1)):
-        column = effect[:t, t]
-        newest = np.flatnonzero(column == 1)
-        if newest.size and (column[newest[-1] + 1 :] == 0).all():
-            ages[t] = t - 1 - newest[-1]
-    return ages
+    return _shown(pushes.obs, np.arange(len(pushes.obs)) + 1)  # as if each action acted at once
 
 
 def _shown(effect: Array, acted: Array) -> Array:

@@ -65,9 +65,6 @@ def read_signals(
     _check_times(path, stamps, seconds, episodes)
     us, u_names = table.join(groups["commands"])
     ys, y_names = table.join(groups["observations"])
-    for values, what in ((us, "command"), (ys, "observation")):
-        if (values == values[0]).all():
-            raise DelayRLError(f"{path}: every {what} is constant, which shows nothing about a delay")
     return Log(seconds - seconds[0], us, ys, episodes, u_names, y_names)
 
 
@@ -96,16 +93,15 @@ def resample(log: Log) -> tuple[Log, float]:
     breaks = ~inside | (gaps > GAP * step)
     pieces = np.concatenate([[0], np.cumsum(breaks)])
     if (np.abs(gaps[~breaks] / step - 1) < 0.1).all():
-        taken, numbers = np.arange(len(log.time)), pieces
+        taken = np.arange(len(log.time))
     else:
-        rows, counts = [], []
+        rows = []
         for piece in range(int(pieces[-1]) + 1):
             own = np.flatnonzero(pieces == piece)
             grid = np.arange(log.time[own[0]] + step / 2, log.time[own[-1]] + step, step)
             rows.append(own[np.searchsorted(log.time[own], grid, "right") - 1])
-            counts.append(np.full(len(grid), piece))
-        taken, numbers = np.concatenate(rows), np.concatenate(counts)
-    time, episode = np.arange(len(taken), dtype=float) * step, numbers.astype(float)
+        taken = np.concatenate(rows)
+    time, episode = np.arange(len(taken), dtype=float) * step, pieces[taken].astype(float)
     observations = log.observations[taken]
     return replace(log, time=time, commands=log.commands[taken], observations=observations, episode=episode), step
 
@@ -167,8 +163,7 @@ class _Table:
         blocks = {name: self.matrix(name) for name in names}
         labels: list[str] = []
         for name, block in blocks.items():
-            size = block.shape[1]
-            labels += [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
+            labels += [name] if block.shape[1] == 1 else [f"{name}[{i}]" for i in range(block.shape[1])]
         return np.concatenate(list(blocks.values()), 1), tuple(labels)
 
 
