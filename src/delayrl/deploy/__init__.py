@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from delayrl.deploy.runtime.controller import Controller as Controller
 from delayrl.deploy.runtime.controller import ControlPolicy as ControlPolicy
 from delayrl.deploy.runtime.controller import OverrunError as OverrunError
-from delayrl.deploy.runtime.history import ClockError as ClockError
+from delayrl.deploy.runtime.episode import ClockError as ClockError
 from delayrl.deploy.runtime.telemetry import Statistics as Statistics
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from delayrl.deploy.backends.network import Act, Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
-from delayrl.deploy.runtime.history import LONGEST_STEP, SHORTEST_STEP
+from delayrl.deploy.runtime.episode import LONGEST_STEP, SHORTEST_STEP
 from delayrl.errors import DelayRLError
 
 BACKENDS = ("numpy", "onnx", "jax")

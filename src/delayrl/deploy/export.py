@@ -7,7 +7,7 @@ import numpy as np
 import safetensors.numpy
 
 from delayrl.deploy.backends.network import Arrays, Network
-from delayrl.deploy.backends.onnx_graph import onnx_graph
+from delayrl.deploy.backends.onnx_policy import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
 from delayrl.envs import make, seconds_of
 from delayrl.play.policy import Policy, restored

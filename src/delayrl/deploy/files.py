@@ -37,8 +37,7 @@ HEADER_LIMIT = 1 << 20
 def read_files(path: str | Path, wanted: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Read bundle.json and those `wanted` files that it lists; return its content, and the bytes of all files by name.
 
-    Raises:
-        DelayRLError: anything missing, cut, changed, or not a regular file.
+    Raises DelayRLError for anything missing, cut, changed, or not a regular file.
     """
     home = Path(path)
     if not home.is_dir():

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +84,6 @@ def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | Non
 
 def available(backend: str) -> bool:
     """Whether the packages of a backend are installed."""
-    from importlib.util import find_spec
-
     return find_spec({"numpy": "numpy", "onnx": "onnxruntime", "jax": "jax"}[backend]) is not None
 
 

@@ -1,25 +1,106 @@
-"""Run a bundle's policy.onnx with onnxruntime, on one thread."""
+"""A bundle's policy as an ONNX graph, built node by node and run with onnxruntime on one thread.
 
+The graph maps (obs [S], actions [Δ, A], age []) to an action [A]. It is stateless, works in the task's units, and holds
+the bundle's metadata. It computes the same folded form as `numpy_policy`, with standard operators of opset 17 only and
+without control flow.
+"""
+
+import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from delayrl.deploy.backends.network import Act, Network
+from delayrl.deploy.backends.network import Act, Arrays, Network
+from delayrl.deploy.backends.numpy_policy import Encoder, Layer, fold, layers
 from delayrl.errors import DelayRLError, first_line
 
+OPSET, IR = 17, 8
 LOCATION = b"location"
 """The key with which a graph refers to a file with its numbers. Older versions of onnxruntime would read any file."""
+
+
+class Graph:
+    """Collect nodes and constants. Their names number them in order of creation."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, value: ArrayLike, kind: Any = np.float32) -> str:
+        """Add an array; return its name, an input for nodes."""
+        from onnx import numpy_helper
+
+        name = f"c{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
+        return name
+
+    def __call__(self, operator: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+        """Add a node; return the name of its output."""
+        from onnx import helper
+
+        output = output or f"x{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, list(inputs), [output], **attributes))
+        return output
+
+    def linear(self, layer: Layer, x: str) -> str:
+        """Add x w + b; return its name."""
+        return self("Add", self("MatMul", x, self.constant(layer[0])), self.constant(layer[1]))
+
+    def mlp(self, layers: list[Layer], x: str) -> str:
+        """Add an MLP with ReLU between its layers; return its name."""
+        for layer in layers[:-1]:
+            x = self("Relu", self.linear(layer, x))
+        return self.linear(layers[-1], x)
+
+
+def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) -> bytes:
+    """Return the serialised model. Raises DelayRLError if the package `onnx` is not installed."""
+    try:
+        import onnx
+        from onnx import TensorProto, helper
+    except ImportError as error:
+        raise DelayRLError("exporting a policy needs the package onnx: pip install 'delayrl[deploy]'") from error
+    graph = Graph()
+    low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
+    row = graph("Reshape", "obs", graph.constant([1, network.obs_size], np.int64))
+    if network.input == "observation":
+        raw = graph.mlp(layers(arrays, "head"), row)
+    else:
+        shifted = graph("Mul", graph("Sub", "actions", graph.constant(low)), graph.constant(2 / (high - low)))
+        scaled = graph("Sub", shifted, graph.constant(1))
+        if network.input == "augmented":
+            raw = graph.mlp(layers(arrays, "head"), _augmented(graph, network, row, scaled))
+        else:
+            encoder, head = fold(network, arrays)
+            raw = graph.mlp(head, _encoded(graph, encoder, row, scaled))
+    if current := layers(arrays, "current"):
+        delayed = graph("Greater", "age", graph.constant(0, np.int64))
+        raw = graph("Where", delayed, raw, graph.mlp(current, row))
+    unit = graph("Reshape", graph("Tanh", raw), graph.constant([network.action_size], np.int64))
+    gained = graph("Mul", graph("Add", unit, graph.constant(1)), graph.constant((high - low) / 2))
+    graph("Add", gained, graph.constant(low), output="action")
+
+    declare, real = helper.make_tensor_value_info, TensorProto.FLOAT
+    inputs = [declare("obs", real, [network.obs_size])]
+    inputs += [declare("actions", real, [network.max_age, network.action_size]), declare("age", TensorProto.INT64, [])]
+    outputs = [declare("action", real, [network.action_size])]
+    body = helper.make_graph(graph.nodes, "delayrl", inputs, outputs, graph.constants)
+    opsets = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(body, producer_name="delayrl", opset_imports=opsets, ir_version=IR)
+    text = json.dumps(metadata, sort_keys=True).replace("location", "l\\u006fcation")  # see LOCATION
+    helper.set_model_props(model, {"delayrl": text})
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString(deterministic=True)
 
 
 def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
     """Return the policy in the graph as a function.
 
     The graph may come from anywhere. Its inputs and outputs must be those of our graphs, and its actions must agree
-    with `reference`, the policy in the weights, on a few inputs.
-
-    Raises:
-        DelayRLError: onnxruntime is not installed, or the graph is not this policy.
+    with `reference`, the policy in the weights, on a few inputs. Raises DelayRLError if they do not, or if onnxruntime
+    is not installed.
     """
     try:
         import onnxruntime
@@ -60,6 +141,47 @@ def onnx_policy(network: Network, model: bytes, reference: Act) -> Act:
         if not same.all():
             raise DelayRLError("it gives other actions than the weights beside it")
     return act
+
+
+def _augmented(graph: Graph, network: Network, row: str, scaled: str) -> str:
+    slots = graph.constant(np.arange(network.max_age)[:, None], np.int64)
+    known = graph("Where", graph("Less", slots, "age"), scaled, graph.constant(0))
+    flat = graph("Reshape", known, graph.constant([1, -1], np.int64))
+    share = graph("Div", graph("Cast", "age", to=1), graph.constant(network.max_age))
+    return graph("Concat", row, flat, graph("Reshape", share, graph.constant([1, 1], np.int64)), axis=1)
+
+
+def _encoded(graph: Graph, encoder: Encoder, row: str, scaled: str) -> str:
+    """Return the last token's output, [1, width]. At age 0 it is computed from one token, and not used."""
+    width = encoder.obs.shape[1]
+    ones, zeros = np.ones(width, np.float32), np.zeros(width, np.float32)
+    start, end = graph.constant([0], np.int64), graph.constant([2**31], np.int64)
+    age = graph("Reshape", graph("Max", "age", graph.constant(1, np.int64)), graph.constant([1], np.int64))
+
+    def norm(x: str, scale: ArrayLike = ones, shift: ArrayLike = zeros) -> str:
+        return graph("LayerNormalization", x, graph.constant(scale), graph.constant(shift), axis=-1, epsilon=1e-5)
+
+    tokens = graph("MatMul", graph("Slice", scaled, start, age), graph.constant(encoder.action))
+    tokens = graph("Add", tokens, graph("Slice", graph.constant(encoder.position), start, age))
+    x = norm(graph("Add", tokens, graph("MatMul", row, graph.constant(encoder.obs))), *encoder.norm_in)
+    length = len(encoder.position)
+    future = graph.constant(np.triu(np.full((length, length), -np.inf), 1))
+    both = graph("Concat", age, age, axis=0)
+    future = graph("Slice", future, graph.constant([0, 0], np.int64), both, graph.constant([0, 1], np.int64))
+    for i, block in enumerate(encoder.blocks):
+        asking = x = norm(x, block.scale, block.shift)
+        if i == len(encoder.blocks) - 1:
+            asking = graph("Slice", x, graph.constant([-1], np.int64), end, start)
+        scores = graph("MatMul", graph.linear(block.attend, asking), graph("Transpose", x, perm=[1, 0]))
+        if i < len(encoder.blocks) - 1:
+            scores = graph("Add", scores, future)
+        mixed = graph("MatMul", graph("Softmax", scores, axis=-1), x)
+        x = graph("Add", asking, graph.linear(block.value, mixed))
+        hidden = graph.linear(block.first, norm(x))
+        bell = graph("Add", graph("Erf", graph("Mul", hidden, graph.constant(0.5**0.5))), graph.constant(1))
+        gelu = graph("Mul", graph("Mul", hidden, bell), graph.constant(0.5))
+        x = graph("Add", x, graph.linear(block.second, gelu))
+    return norm(x)
 
 
 def _quoted(error: Exception) -> str:

@@ -35,9 +35,8 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delayrl.deploy.runtime.episode import Episode
-from delayrl.deploy.runtime.history import Action, Clock, History, Stamps
-from delayrl.deploy.runtime.telemetry import Arrival, Statistics, Telemetry
+from delayrl.deploy.runtime.episode import Action, Arrival, Clock, Episode, History, Stamps
+from delayrl.deploy.runtime.telemetry import Statistics, Telemetry
 from delayrl.errors import DelayRLError
 
 OnOverrun = Literal["hold", "clip", "raise"]

@@ -2,12 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-from delayrl.deploy.runtime.history import Stamps
-
-Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
-"""What became of an observation; see `Statistics`. Only new ones are used."""
+from delayrl.deploy.runtime.episode import Arrival, Stamps
 
 
 @dataclass(frozen=True)
