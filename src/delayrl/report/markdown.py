@@ -12,21 +12,14 @@ from delayrl.report.statistics import mean_std
 from delayrl.report.summary import Aggregate, Summary
 from delayrl.report.tables import Table
 
+Pictures = Mapping[tuple[Setting, str], list[str]]
 GREY = '<span style="color:#888">{}</span>'
 
 
-def markdown(
-    summary: Summary,
-    title: str,
-    pictures: Mapping[tuple[Setting, str], list[str]],
-    versions: Sequence[Mapping[str, Any]] = (),
-) -> str:
+def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequence[Mapping[str, Any]] = ()) -> str:
     """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
-    parts = [
-        f"# {_escape(title)}",
-        f"{wording.states(summary)}. † reads the true state while it trains. ± is the standard deviation over seeds. "
-        f"{wording.PAPER}",
-    ]
+    legend = "† reads the true state while it trains. ± is the standard deviation over seeds."
+    parts = [f"# {_escape(title)}", f"{wording.states(summary)}. {legend} {wording.PAPER}"]
     if summary.unplaced:
         parts.append(f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out.")
     parts += [_escape(line) for line in wording.overrides(summary) + wording.made_with(versions)]
@@ -40,15 +33,12 @@ def markdown(
         aggregates = [a for a in summary.aggregates if a.setting == setting]
         if aggregates:
             parts += ["### Interquartile mean of the normalised return over tasks", _aggregates(summary, aggregates)]
-        for kind, name in (
-            ("aggregates", "Interquartile means and performance profiles"),
-            ("curves", "Learning curves"),
-            ("delay", "Return against delay"),
-        ):
+        alternative = "Interquartile means and performance profiles"
+        parts += [f"![{alternative}](img/{file})" for file in pictures.get((setting, "aggregates"), [])]
+        for kind, name in (("curves", "Learning curves"), ("delay", "Return against delay")):
             files = pictures.get((setting, kind), [])
-            if files and kind != "aggregates":
-                parts.append(f"### {name}")
-            parts += [f"![{name}](img/{file})" for file in files]
+            if files:
+                parts += [f"### {name}", *(f"![{name}](img/{file})" for file in files)]
         parts += ["### Anchors", _anchors(results), "### All cells", _results(summary, results)]
     return "\n\n".join(part for part in parts if part) + "\n"
 

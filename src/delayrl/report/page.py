@@ -125,23 +125,13 @@ def _table(table: Table, names: Names) -> dict[str, Any]:
         entries = [table.entries[env, delay, column] for column in table.columns]
         texts = [[_rounded(e.value), e.partial, *wording.entry_texts(table, e)] for e in entries]
         rows.append([names["tasks"].index(env), names["delays"].index(delay), texts])
-    return {
-        "kind": table.kind,
-        "title": table.title,
-        "source": wording.source(table),
-        "setting": names["settings"].index(table.setting),
-        "columns": [names["agents"].index(column) for column in table.columns],
-        "rows": rows,
-    }
+    labels = {"kind": table.kind, "title": table.title, "source": wording.source(table)}
+    columns = [names["agents"].index(column) for column in table.columns]
+    return labels | {"setting": names["settings"].index(table.setting), "columns": columns, "rows": rows}
 
 
 def _aggregate(a: Aggregate, names: Names) -> dict[str, Any]:
-    return {
-        "setting": names["settings"].index(a.setting),
-        "delay": None if a.delay is None else names["delays"].index(a.delay),
-        "agent": names["agents"].index(a.label),
-        "iqm": _rounded([a.iqm, a.low, a.high]),
-        "tasks": a.tasks,
-        "runs": a.runs,
-        "profile": _rounded([a.profile, a.profile_low, a.profile_high], 5),
-    }
+    delay = None if a.delay is None else names["delays"].index(a.delay)
+    place = {"setting": names["settings"].index(a.setting), "delay": delay, "agent": names["agents"].index(a.label)}
+    iqm, profile = _rounded([a.iqm, a.low, a.high]), _rounded([a.profile, a.profile_low, a.profile_high], 5)
+    return place | {"iqm": iqm, "tasks": a.tasks, "runs": a.runs, "profile": profile}

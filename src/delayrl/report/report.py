@@ -25,7 +25,7 @@ def report(
         rows: as for `summarise`.
         standing: as for `summarise`; may be empty.
         out: the folder.
-        title: of the report.
+        title: the heading.
         versions: libraries, commit and hardware that made the rows, as in a run's configuration.
 
     Raises:
@@ -36,12 +36,10 @@ def report(
         raise DelayRLError("there is nothing to report: no cells and no rows")
     try:
         pictures = figures.draw(summary, out / "img")
-        texts = {
-            "report.md": markdown(summary, title, pictures, versions),
-            "report.html": page(summary, title, versions),
-        }
-        for name, text in texts.items():
-            (out / name).write_text(text, encoding="utf-8", errors="replace")
+        text = markdown(summary, title, pictures, versions)
+        (out / "report.md").write_text(text, encoding="utf-8", errors="replace")
+        text = page(summary, title, versions)
+        (out / "report.html").write_text(text, encoding="utf-8", errors="replace")
     except OSError as error:
         raise DelayRLError(f"the report cannot be written to {out}: {error.strerror or error}") from error
     return out / "report.html"

@@ -90,8 +90,7 @@ def _group(row: Mapping[str, Any]) -> RowGroup:
 def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
     """Yield the rows of rows.jsonl files, and of files that `benchmarks/collect.py` wrote.
 
-    Raises:
-        DelayRLError: a file cannot be read, or a line is not a row.
+    Raises DelayRLError if a file cannot be read, or a line is not a row.
     """
     for path in paths:
         configs: dict[Any, Row] = {}

@@ -43,19 +43,14 @@ def interquartile_mean(scores: ArrayLike) -> Floats:
 
 
 def stratified_bootstrap(
-    strata: Sequence[ArrayLike],
-    statistic: Callable[[Floats], Floats],
-    repetitions: int = 2000,
-    seed: int = 0,
+    strata: Sequence[ArrayLike], statistic: Callable[[Floats], Floats], repetitions: int = 2000, seed: int = 0
 ) -> tuple[Floats, Floats]:
-    """Estimate the 95 % percentile interval of a statistic of pooled scores.
-
-    Runs are drawn with replacement within their stratum.
+    """Estimate the 95 % percentile interval of a statistic of pooled scores, resampling runs within their stratum.
 
     Args:
         strata: scores of each task, at least one in each.
         statistic: of scores [repetitions, runs], along the last axis; returns [repetitions, ...].
-        repetitions: how many times.
+        repetitions: how many resamples.
         seed: the same scores and seed give the same interval.
 
     Returns:
@@ -80,11 +75,7 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
 
 
 def common_steps(runs: Sequence[Mapping[int, float]]) -> tuple[NDArray[np.int64], Floats]:
-    """Align runs, returns by step, on the steps that all of them have, so that every mean is over the same runs.
-
-    Returns:
-        Steps [N], in order, and returns [runs, N].
-    """
+    """Return the steps that all runs have, [N], and the returns there, [runs, N]: every mean is over the same runs."""
     if not runs:
         return np.zeros(0, np.int64), np.zeros((0, 0))
     steps = sorted(set(runs[0]).intersection(*runs[1:]))

@@ -101,16 +101,13 @@ def _table(
     for (env, delay), label in product(rows, columns):
         overrides = conditions[label].overrides if label in conditions else {}
         agent = conditions[label].agent if label in conditions else label
-        published = _published(kind, env, delay, agent, str(overrides.get("representation", "transformer")))
+        representation = str(overrides.get("representation", "transformer"))
+        if kind != "ablation" and representation == "transformer":
+            representation = ""  # only values of the ablation name one
+        measure = "steps" if kind == "steps" else "normalised"
+        published = published_values().get((measure, env.removeprefix("delayrl/"), str(delay), agent, representation))
         entries[env, delay, label] = _entry(kind, results.get(Place(setting, env, delay, label)), published)
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
-
-
-def _published(kind: Kind, env: str, delay: int | str, agent: str, representation: str) -> PublishedValue | None:
-    measure = "steps" if kind == "steps" else "normalised"
-    if kind != "ablation" and representation == "transformer":
-        representation = ""  # only values of the ablation name one
-    return published_values().get((measure, env.removeprefix("delayrl/"), str(delay), agent, representation))
 
 
 def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) -> TableEntry:
