@@ -68,8 +68,8 @@ def run(given: argparse.Namespace) -> None:
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:
     for cell in grid.cells:
-        state, condition = f"{cell.id}  {status(cell, given.runs):<7}", cell.condition
-        print(f"{state}  {cell}, preset {condition.preset}, {condition.steps:,} steps")
+        setup = f"preset {cell.condition.preset}, {cell.condition.steps:,} steps"
+        print(f"{cell.id}  {status(cell, given.runs):<7}  {cell}, {setup}")
     runs = sum(len(cell.seeds) for cell in grid.cells)
     steps = sum(cell.condition.steps * len(cell.seeds) for cell in grid.cells)
     print(f"\n{grid.name}: {len(grid.cells)} cells, {runs} runs, {steps:,} steps")

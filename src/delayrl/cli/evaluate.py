@@ -45,8 +45,7 @@ def _sweep(given: argparse.Namespace) -> None:
     if given.delay is not None:
         raise DelayRLError("--sweep plays every delay; leave --delay out")
     delays = load(given.run).spec.delay + 1
-    bar = tqdm(sweep(given.run, given.episodes, given.seed), total=delays, unit="delay", disable=given.json)
-    results = list(bar)
+    results = list(tqdm(sweep(given.run, given.episodes, given.seed), total=delays, unit="delay", disable=given.json))
     if given.json:
         print(json.dumps(results))
     else:

@@ -104,10 +104,8 @@ def check_target(out: Path, *, force: bool = False) -> None:
 def write_files(out: Path, files: Mapping[str, bytes], *, force: bool = False) -> None:
     """Write a bundle into a new or empty folder, or with `force` over an older bundle.
 
-    All files are written beside the folder first and then moved into it. Other files in it are kept.
-
-    Raises:
-        DelayRLError: the folder holds something else, or the disk refuses.
+    All files are written beside the folder first and then moved into it. Other files in it are kept. Raises
+    DelayRLError if the folder holds something else, or the disk refuses.
     """
     check_target(out, force=force)
     with disk_errors(out):

@@ -77,11 +77,8 @@ def card(metadata: Mapping[str, Any], repo: str) -> str:
     agent, env, delay = (plain(metadata.get(name)) for name in ("agent", "env", "delay"))
     head: dict[str, Any] = {"library_name": "delayrl", "pipeline_tag": "reinforcement-learning"}
     head["tags"] = ["reinforcement-learning", "delay", "delayrl", agent, env]
-    lines = [f"# {agent} on {env}, delay {delay}", ""]
-    lines.append(
-        "A policy for observations that arrive late: it takes the newest observation that has arrived, its age in "
-        "steps, and the actions applied since."
-    )
+    about = "A policy for observations that arrive late: it takes the newest observation that has arrived, its age"
+    lines = [f"# {agent} on {env}, delay {delay}", "", f"{about} in steps, and the actions applied since."]
     lines += ["", "| | |", "| --- | --- |", f"| observation | {policy['obs_size']} numbers |"]
     lines += [f"| action | {policy['action_size']} numbers |", f"| ages | 0 .. {policy['max_age']} |"]
     lines += [f"| {name} | {plain(metadata.get(name))} |" for name in ("dt", "preset", "protocol", "seed", "step")]

@@ -69,11 +69,9 @@ def innovations(commands: Array, observations: Array, episode: Array) -> tuple[A
 
 
 def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, int]:
-    """Sum the products of lagged u and y in `count` consecutive blocks of rows.
+    """Sum the products of lagged u and y in `count` blocks of rows; return [count, lags, U, Y] and the rows of a block.
 
-    Returns:
-        Sums [count, lags, U, Y], for the lags 1..longest followed by far lags, as many as the log allows; and the
-        number of rows of a block.
+    The lags are 1..longest, followed by far lags, as many as the log allows.
     """
     size = len(u) // count
     rows = size * count

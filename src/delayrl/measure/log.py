@@ -153,10 +153,8 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
         raise DelayRLError(f"{path}: every observation has the same stamp")
     if delays.min() < 0:
         row = int(np.argmin(delays))
-        raise DelayRLError(
-            f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made, so the clocks differ by at least "
-            "that; synchronise them (PTP, NTP), or stamp both ends with one clock"
-        )
+        hint = "the clocks differ by at least that; synchronise them (PTP, NTP), or stamp both ends with one clock"
+        raise DelayRLError(f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made: {hint}")
     row_spacing = float(np.median(np.diff(made)))
     warm = WARM_UP * float(start[-1]) if warm_up is None else warm_up
     used = start >= warm
@@ -205,10 +203,9 @@ def _correlated(
     correlation = correlate.correlation(sums, size, lags)
     first = correlate.onset(correlation)
     if first is None:
-        raise DelayRLError(
-            f"{path}: no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance. "
-            "A longer log, other columns, or commands with some random variation may show one"
-        )
+        hint = "A longer log, other columns, or commands with some random variation may show one"
+        unseen = f"no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance"
+        raise DelayRLError(f"{path}: {unseen}. {hint}")
     random, dead_times = np.random.default_rng(seed), []
     for _ in range(RESAMPLINGS):  # blocks are drawn with replacement
         weights = np.bincount(random.integers(0, blocks, blocks), minlength=blocks).astype(float)

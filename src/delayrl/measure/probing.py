@@ -159,10 +159,8 @@ def _scout(env: Env, name: str, seed: int, longest: int) -> tuple[float, int]:
                 seen.append((spare, scale, delay))
     if not seen:
         ended = "" if played == steps else f" (no episode was longer than {played} steps)"
-        raise DelayRLError(
-            f"{name}: no observation reacted to an action within {min(played, longest)} steps{ended}: the delay is "
-            "longer, or observations do not depend on actions"
-        )
+        unseen = f"no observation reacted to an action within {min(played, longest)} steps{ended}"
+        raise DelayRLError(f"{name}: {unseen}: the delay is longer, or observations do not depend on actions")
     return max(seen, key=itemgetter(0))[1:]
 
 
@@ -173,11 +171,9 @@ def _check_repeats(name: str, played: Rollout, again: Rollout) -> None:
         same &= ~differs(a[:length], b[:length]).any(1)
     if not same.all() or len(played.obs) != len(again.obs):
         step = int(np.argmin([*same, False]))
-        raise DelayRLError(
-            f"{name} does not repeat itself: two roll-outs with the same seed and actions differ at step {step}. "
-            "Let reset(seed=…) fix all random numbers (sample them from self.np_random, in wrappers too), or probe it "
-            "without noise"
-        )
+        seen = f"two roll-outs with the same seed and actions differ at step {step}"
+        hint = "Let reset(seed=…) fix all random numbers (from self.np_random, in wrappers too), or probe without noise"
+        raise DelayRLError(f"{name} does not repeat itself: {seen}. {hint}")
 
 
 def _action_channel(pushes: list[Pushes]) -> tuple[str, str]:

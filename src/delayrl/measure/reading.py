@@ -51,10 +51,8 @@ def read_signals(
         starts = tuple(given or PREFIXES[what])
         names = [n for n in table.names if n != stamps and n.lower().startswith(tuple(s.lower() for s in starts))]
         if not names:
-            raise DelayRLError(
-                f"{path} has no column for {what}: none begins with {' or '.join(starts)}; name them with --{what}. "
-                f"It has {_few(table.names)}"
-            )
+            hint = f"none begins with {' or '.join(starts)}; name them with --{what}. It has {_few(table.names)}"
+            raise DelayRLError(f"{path} has no column for {what}: {hint}")
         groups[what] = names
     both = set(groups["commands"]) & set(groups["observations"])
     if both:
@@ -128,10 +126,8 @@ class _Table:
             if name in self._columns:
                 return name
         if needed or given is not None:
-            raise DelayRLError(
-                f"{self.path}: no column {' or '.join(map(str, wanted))} for the {what}; name it with {option}. "
-                f"It has {_few(self.names)}"
-            )
+            hint = f"name it with {option}. It has {_few(self.names)}"
+            raise DelayRLError(f"{self.path}: no column {' or '.join(map(str, wanted))} for the {what}; {hint}")
         return ""
 
     def column(self, name: str) -> Array:
@@ -210,10 +206,8 @@ def _check_times(path: Path, name: str, seconds: Array, episodes: Array) -> None
     if (gaps <= 0).any():
         row = int(np.argmax(gaps <= 0)) + 1
         what = "repeats" if gaps[row - 1] == 0 else "goes back"
-        raise DelayRLError(
-            f"{path}, row {row + 1}: {name} {what}; time stamps must increase. Sort the rows, drop duplicates, or name "
-            "a column with --episode that changes where a new recording begins"
-        )
+        hint = "drop duplicates, or name a column with --episode that changes where a new recording begins"
+        raise DelayRLError(f"{path}, row {row + 1}: {name} {what}; time stamps must increase. Sort the rows, {hint}")
 
 
 def _number(cell: Any) -> bool:

@@ -70,10 +70,8 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
         except (TypeError, ValueError, OverflowError, AttributeError, DelayRLError):
             raise DelayRLError(f"row {number} of the results is damaged: {str(row)[:200]}") from None
         if episode in evaluation.episodes:
-            raise DelayRLError(
-                f"row {number} of the results is there twice: {groups[key].condition}, seed {seed}, step {step}, "
-                f"episode {episode}; give every file of rows once"
-            )
+            place = f"{groups[key].condition}, seed {seed}, step {step}, episode {episode}"
+            raise DelayRLError(f"row {number} of the results is there twice: {place}; give every file of rows once")
         evaluation.total += value
         evaluation.episodes.add(episode)
     return list(groups.values())

@@ -52,11 +52,8 @@ class Network:
         def norm(name: str) -> None:
             shapes[f"{name}.scale"] = shapes[f"{name}.shift"] = (self.width,)
 
-        sizes = {
-            "observation": self.obs_size,
-            "augmented": self.obs_size + self.max_age * self.action_size + 1,
-            "transformer": self.width,
-        }
+        augmented = self.obs_size + self.max_age * self.action_size + 1
+        sizes = {"observation": self.obs_size, "augmented": augmented, "transformer": self.width}
         mlp("head", sizes[self.input], self.hidden)
         if self.current is not None:
             mlp("current", self.obs_size, self.current)
@@ -130,14 +127,9 @@ def parse(document: Any) -> Network:
         raise DelayRLError(f"its policy's input must be one of {', '.join(INPUTS)}; the last two need an age")
     if kind == "transformer" and document.get("current") is None:
         raise DelayRLError("its policy's input is transformer, which has no output at age 0: it needs a current")
+    hidden = widths("hidden")
+    current = None if document.get("current") is None else widths("current")
     least = int(kind == "transformer")
-    return Network(
-        **sizes,
-        low=low,
-        high=high,
-        input=kind,
-        hidden=widths("hidden"),
-        current=None if document.get("current") is None else widths("current"),
-        width=integer("width", least, document.get("width")),
-        blocks=integer("blocks", least, document.get("blocks"), 1000),
-    )
+    width = integer("width", least, document.get("width"))
+    blocks = integer("blocks", least, document.get("blocks"), 1000)
+    return Network(**sizes, low=low, high=high, input=kind, hidden=hidden, current=current, width=width, blocks=blocks)
