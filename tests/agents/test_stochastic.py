@@ -152,7 +152,6 @@ def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_official_episodes_have_their_own_travel_times() -> None:
     """One start state, as in the released code; but not one sequence of delays."""
     actor = Actor(delayrl.make("delayrl/Counter-v0", "uniform:0:4", rescale=True), 0, False, OFFICIAL)
-    actor.reset()
     ages: list[list[int]] = [[]]
     for _ in range(300):
         done = actor.step(np.zeros(1, np.float32)).done
