@@ -14,7 +14,6 @@ from delayrl.report.statistics import NAN, Floats
 from delayrl.run.cell import Cell, Progress, State
 from delayrl.run.condition import Condition
 
-Standing = Sequence[tuple[Cell, Progress]]
 PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
 """Columns of the paper's tables."""
 
