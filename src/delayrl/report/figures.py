@@ -94,9 +94,7 @@ def _save(figure: Any, path: Path) -> None:
     for panel in figure.axes:
         lines |= {label: line for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     names = sorted(lines, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
-    figure.legend(
-        [lines[name] for name in names], names, loc="outside lower center", ncols=5, frameon=False, fontsize=9
-    )
+    figure.legend([lines[key] for key in names], names, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
