@@ -13,3 +13,9 @@ def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type where the message is empty."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
+
+
+def described(error: BaseException) -> str:
+    """Return the type of an error and the first line of its message, if it has one."""
+    name, line = type(error).__name__, first_line(error)
+    return name if line == name else f"{name}: {line}"

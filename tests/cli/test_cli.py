@@ -41,7 +41,7 @@ def test_train_ends_with_a_summary(run: Path, capsys: pytest.CaptureFixture[str]
     """The same command on a complete run says so, trains nothing, and shows the summary again."""
     main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "3", "--out", str(run), *TINY[:-1]])
     out, err = capsys.readouterr()
-    assert "found complete at step 240" in err
+    assert "already complete at step 240" in err
     for words in ("return under delay", "its reference, no delay", str(run), "delayrl evaluate", "curve.png"):
         assert words in out
 

@@ -17,7 +17,7 @@ from delayrl.bench import folders
 from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
-from delayrl.run.cell import Cell, Progress, State
+from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.disk import draft
 from delayrl.run.folder import Run
 from delayrl.run.rows import EPISODE, Row, check_row
@@ -147,8 +147,8 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list
     return rows, cells, _distinct(versions)
 
 
-def _stored_cell(id: str, text: str, state: State, step: int, speed: float | None) -> tuple[Cell, Progress]:
-    if state not in get_args(State) or type(step) is not int:
+def _stored_cell(id: str, text: str, state: CellState, step: int, speed: float | None) -> tuple[Cell, Progress]:
+    if state not in get_args(CellState) or type(step) is not int:
         raise ValueError(f"cell {id} has an invalid state or step")
     return Cell.from_json(dict(json.loads(text)), id), Progress(state, step, speed)
 

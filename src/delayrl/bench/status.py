@@ -7,10 +7,8 @@ from pathlib import Path
 from statistics import median
 
 from delayrl.bench import folders
-from delayrl.run.cell import Cell, Progress, State
+from delayrl.run.cell import Cell, CellState, Progress, Standing
 
-Standing = Sequence[tuple[Cell, Progress]]
-"""Cells, each with how far it is."""
 HEAD = ("id", "agent", "task", "delay", "seeds", "state", "steps", "steps/s", "time left")
 
 
@@ -30,7 +28,7 @@ def progress(cell: Cell, runs: Path) -> Progress:
     return Progress("todo", step, speed)
 
 
-def status(cell: Cell, runs: Path) -> State:
+def status(cell: Cell, runs: Path) -> CellState:
     """Read from disk whether a cell is to do, running, done or failed."""
     return progress(cell, runs).state
 

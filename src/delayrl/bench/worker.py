@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from delayrl.bench.folders import LockedError, hold, journal, note, seed_folders, stored
-from delayrl.errors import DelayRLError, StoppedError, first_line
+from delayrl.errors import DelayRLError, StoppedError, described
 
 Kind = Literal["done", "stopped", "failed", "died", "locked"]
 
@@ -47,7 +47,7 @@ def work(folder: Path, device: str | None = None) -> Outcome:
         return Outcome("failed", str(error))
     except Exception as error:
         _log(traceback.format_exc())
-        return Outcome("died", f"{type(error).__name__}: {first_line(error)}")
+        return Outcome("died", described(error))
 
 
 def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:

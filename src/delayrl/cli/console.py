@@ -18,7 +18,8 @@ class Parser(argparse.ArgumentParser):
         given, rest = self.parse_known_args(words)
         if rest:
             unknown = next((word for word in rest if word.startswith("--")), "").split("=")[0]
-            near = difflib.get_close_matches(unknown, self._option_string_actions, n=3, cutoff=0.4)
+            options = [name for name in self._option_string_actions if name not in ("-h", "--help")]
+            near = difflib.get_close_matches(unknown, options, n=3, cutoff=0.4)
             hint = f"; did you mean {', '.join(near)}?" if near else ""
             self.error(f"unexpected {' '.join(rest)!r}{hint}")
         return given

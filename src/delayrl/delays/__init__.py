@@ -4,6 +4,7 @@ from delayrl.delays.channels import PAPER_STOCHASTIC_5 as PAPER_STOCHASTIC_5
 from delayrl.delays.channels import Channel as Channel
 from delayrl.delays.channels import Delay as Delay
 from delayrl.delays.channels import DelayLike as DelayLike
+from delayrl.delays.channels import Rule as Rule
 from delayrl.delays.channels import as_delay as as_delay
 from delayrl.delays.channels import short_label as short_label
 from delayrl.delays.laws import Choice as Choice

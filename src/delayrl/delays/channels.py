@@ -94,7 +94,7 @@ class Delay:
         for name in CHANNELS:
             channel = getattr(self, name)
             if isinstance(channel, str):
-                channel = Parser(channel).channel(channel)
+                channel = DelayParser(channel).channel(channel)
             elif not isinstance(channel, Channel):
                 channel = Channel(channel)
             if not channel.maximum:
@@ -168,7 +168,7 @@ def as_delay(delay: DelayLike, step_seconds: StepSeconds = None) -> Delay:
     if isinstance(delay, Channel):
         return Delay(delay)
     if isinstance(delay, str):
-        return Delay(**Parser(delay, step_seconds).channels())
+        return Delay(**DelayParser(delay, step_seconds).channels())
     if isinstance(delay, float) and delay.is_integer():
         delay = int(delay)
     return Delay(Channel(delay))  # type: ignore[arg-type]
@@ -181,13 +181,11 @@ def short_label(text: int | str) -> int | str:
     return re.sub(r"[\d,./=e-]{40,}", lambda match: hashlib.sha256(match[0].encode()).hexdigest()[:12], text)
 
 
-class Parser:
-    """Parse the text of one delay. The methods raise DelayRLError if they cannot.
+LAWS = ("uniform", "choice", "poisson", "gamma", "gilbert", "walk", "markov", "recorded")
 
-    Args:
-        text: the text.
-        step_seconds: the length of a step. A function is called at most once, and only if the text holds a time.
-    """
+
+class DelayParser:
+    """Parse the text of one delay. The methods raise DelayRLError if they cannot."""
 
     def __init__(self, text: str, step_seconds: StepSeconds = None):
         self._text, self._given_seconds = text, step_seconds
@@ -221,8 +219,10 @@ class Parser:
 
     def law(self, part: str) -> DelayLaw:
         """Return the law that a part of the text describes."""
-        name, _, rest = part.partition(":")
-        if not rest:
+        name, separator, rest = part.partition(":")
+        if not separator and name in LAWS:
+            raise DelayRLError(f"the law {name!r} takes values after a colon ({FORMS})")
+        if not separator:
             return Constant(self.steps(part))
         match name:
             case "uniform":
@@ -257,7 +257,8 @@ class Parser:
         """Split what follows the name of a law at its colons, and read each value with its reader."""
         words = rest.split(":")
         if len(words) != len(readers):
-            raise DelayRLError(f"the delay {self._text!r} needs {len(readers)} values where {rest!r} is ({FORMS})")
+            count = f"{len(readers)} values separated by colons"
+            raise DelayRLError(f"the law in {self._text!r} takes {count}; got {rest!r} ({FORMS})")
         return [reader(word) for reader, word in zip(readers, words, strict=True)]
 
     def real(self, word: str) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from delayrl.errors import DelayRLError
 
 LONGEST, MOST_STATES = 100_000, 1000
-"""Of a delay, in steps, and of a chain. More is a mistake, and its buffers or tables would fill the memory."""
+"""The longest delay in steps, and the largest number of states of a chain. More would fill the memory."""
 
 
 def whole_steps(steps: Any) -> int:
@@ -262,9 +262,10 @@ def _check_states(count: int) -> None:
 
 
 def _delays(steps: tuple[int, ...]) -> tuple[int, ...]:
-    if not steps:
+    delays = tuple(whole_steps(delay) for delay in steps)
+    if not delays:
         raise DelayRLError("a law of delays needs at least one delay; it has none")
-    return tuple(whole_steps(delay) for delay in steps)
+    return delays
 
 
 def _positive(number: float, what: str) -> float:

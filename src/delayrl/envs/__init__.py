@@ -15,6 +15,7 @@ from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper, probe
 from delayrl.errors import DelayRLError, first_line
 from delayrl.wrappers import Delayed, check_spaces
+from delayrl.wrappers.single import check_length
 from delayrl.wrappers.single import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
 
@@ -63,26 +64,20 @@ def make(
 
 
 def delay_of(env: str, delay: DelayLike) -> Delay:
-    """Convert a delay to steps of a task. The task is made only if its step length is needed.
-
-    Raises:
-        DelayRLError: a bad delay; a time for a task that is unknown or does not say how long a step is.
-    """
+    """Convert a delay to steps of a task, which is made only if its step length is needed. Raises DelayRLError."""
 
     def step_seconds() -> float | None:
         task = make(env)
         task.close()
         return seconds_of(task)
 
-    return as_delay(delay, step_seconds)
+    parsed = as_delay(delay, step_seconds)
+    check_length(parsed, gym.registry.get(env))
+    return parsed
 
 
 def physics(env: gym.Env[Any, Any]) -> dict[str, str | None]:
-    """Return what a result depends on besides the agent: the versions of Gymnasium and MuJoCo, and the physics.
-
-    Returns:
-        gymnasium, mujoco, physics (the fingerprint of the model); the last two are None for a task without MuJoCo.
-    """
+    """Return the versions of Gymnasium and MuJoCo and the model's fingerprint; the last two are None without MuJoCo."""
     simulated = hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "frame_skip")
     return {
         "gymnasium": version("gymnasium"),

@@ -88,7 +88,7 @@ class Estimated:
         return fields | {"steps": {str(step): count for step, count in self.counts.items()}}
 
 
-def whole_steps(seconds: float, period: float) -> int:
+def rounded_up_steps(seconds: float, period: float) -> int:
     """Return a delay in steps, rounded up: an action on its way must be in the history. See `TOLERANCE`."""
     return max(0, int(np.ceil(seconds / period - TOLERANCE)))
 
@@ -173,8 +173,8 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
         period=period,
         rows=len(kept),
         warm_up=warm,
-        steps=tuple(whole_steps(d, period) for d in kept),
-        step=whole_steps(float(np.median(kept)), period),
+        steps=tuple(rounded_up_steps(d, period) for d in kept),
+        step=rounded_up_steps(float(np.median(kept)), period),
         longest=float(kept.max()),
         slowest_warm_up=float(delays[~used].max()) if (~used).any() else None,
         drift=float(np.polyfit(times, least, 1)[0]) * 1e6,
@@ -232,8 +232,8 @@ def _correlated(
         period=period,
         rows=rows,
         warm_up=warm,
-        steps=tuple(whole_steps(d, period) for _, d in windows),
-        step=whole_steps(delay, period),
+        steps=tuple(rounded_up_steps(d, period) for _, d in windows),
+        step=rounded_up_steps(delay, period),
         strength=float(strength.max()),
         peak=pairs[0],
         pairs=pairs[:10],

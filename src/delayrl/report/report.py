@@ -8,8 +8,8 @@ from delayrl.errors import DelayRLError
 from delayrl.report import figures
 from delayrl.report.markdown import markdown
 from delayrl.report.page import page
-from delayrl.report.results import Standing
 from delayrl.report.summary import summarise
+from delayrl.run.cell import Standing
 
 
 def report(

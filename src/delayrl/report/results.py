@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from delayrl.report import statistics
 from delayrl.report.rows import RowGroup
 from delayrl.report.statistics import NAN, Floats
-from delayrl.run.cell import Cell, Progress, State
+from delayrl.run.cell import Cell, CellState, Progress, Standing
 from delayrl.run.condition import Condition
 
 PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
@@ -173,7 +173,7 @@ def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup]) 
     )
 
 
-def _state(states: set[State], has_rows: bool) -> State:
+def _state(states: set[CellState], has_rows: bool) -> CellState:
     """The worst of several cells' states. Some seeds done and others not is running."""
     if "failed" in states:
         return "failed"

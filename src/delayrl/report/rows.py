@@ -79,7 +79,7 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
 
 def _group(row: Mapping[str, Any]) -> RowGroup:
     condition = Condition.from_json({name: row[name] for name in CONDITION_COLUMNS} | {"overrides": {}, "steps": 0})
-    if isinstance(condition.delay, int) and abs(condition.delay) >= LIMIT:
+    if isinstance(condition.delay, bool) or (isinstance(condition.delay, int) and abs(condition.delay) >= 2**31):
         raise ValueError
     cell = row.get("cell")
     return RowGroup(None if cell is None else str(cell), condition, row.get("privileged") is True)

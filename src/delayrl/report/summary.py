@@ -9,11 +9,11 @@ import numpy as np
 
 from delayrl.errors import DelayRLError
 from delayrl.report import statistics
-from delayrl.report.results import Place, Result, Setting, Standing, agent_order, delay_order, make_results
+from delayrl.report.results import Place, Result, Setting, agent_order, delay_order, make_results
 from delayrl.report.rows import RowGroup, group_rows
 from delayrl.report.statistics import Floats
 from delayrl.report.tables import Table, make_tables
-from delayrl.run.cell import Cell, Progress
+from delayrl.run.cell import Cell, Progress, Standing
 
 THRESHOLDS = np.round(np.linspace(-0.25, 2.5, 56), 2)
 """At which normalised returns a performance profile is taken."""

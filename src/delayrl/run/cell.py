@@ -1,14 +1,15 @@
 """A cell: the seeds of one condition that are trained together; and how far it is."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Self
 
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
+from delayrl.run.rows import CONDITION
 
-State = Literal["todo", "running", "done", "failed"]
+CellState = Literal["todo", "running", "done", "failed"]
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,9 @@ class Cell:
 
     @property
     def json(self) -> dict[str, Any]:
-        """What is stored of it, its id aside."""
-        return self.condition.json | {"seeds": list(self.seeds)}
+        """What cell.json and the table of results store of it, without its id."""
+        values = self.condition.json | {"seeds": list(self.seeds)}
+        return {name: values[name] for name in (*CONDITION, "seeds", "overrides", "steps")}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], id: str) -> Self:
@@ -54,7 +56,11 @@ class Progress(NamedTuple):
         line: the first line of a failure; who works on a running cell.
     """
 
-    state: State
+    state: CellState
     step: int
     speed: float | None = None
     line: str = ""
+
+
+Standing = Sequence[tuple[Cell, Progress]]
+"""Cells, and how far each is."""

@@ -1,4 +1,4 @@
-"""Checkpoints of a run folder: their manifests, and whether their files are whole. No JAX.
+"""Checkpoints of a run folder: their manifests, and whether their files are intact. No JAX.
 
 `checkpoints/STEP/manifest.json` holds the step, whether the run is complete, and the SHA-256 of each file of the
 checkpoint and of each piece of the replay that it needs.
@@ -37,8 +37,8 @@ class Checkpoint:
         replay = self.path.parents[1] / "replay"
         for name, checksum in (self.files | self.pieces).items():
             file = (replay if name in self.pieces else self.path) / name
-            if Path(name).name != name or _checksum(file) != checksum:
-                raise DelayRLError(f"{name} is cut or changed")
+            if Path(name).name != name or "\0" in name or _checksum(file) != checksum:
+                raise DelayRLError(f"{name!r} is cut or changed")
 
 
 def checkpoint_folders(run: Path) -> list[Path]:
@@ -50,15 +50,15 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint's manifest. Raises DelayRLError if it is missing or damaged."""
     try:
         manifest = json.loads((path / "manifest.json").read_text())
-        step, complete = int(manifest["step"]), bool(manifest["complete"])
+        step, complete = int(path.name), bool(manifest["complete"])
         files, pieces = dict(manifest["files"]), dict(manifest["pieces"])
+        needed = {"agent.safetensors"} if complete else {"agent.safetensors", "loop.safetensors"}
+        if manifest["step"] != step or not needed <= files.keys():
+            raise ValueError
     except OSError as error:
         raise DelayRLError(str(error)) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DelayRLError("its manifest is damaged") from error
-    needed = {"agent.safetensors"} if complete else {"agent.safetensors", "loop.safetensors"}
-    if step != int(path.name) or not needed <= files.keys():
-        raise DelayRLError("its manifest is damaged")
     return Checkpoint(path, step, complete, files, pieces)
 
 

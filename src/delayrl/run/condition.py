@@ -71,12 +71,12 @@ class Setup:
     @property
     def config(self) -> dict[str, Any]:
         """The configuration that a run folder keeps: every option by name, defaults included."""
-        names = {name: getattr(self.condition, name) for name in CONDITION}
+        names = {name: getattr(self.condition, name) for name in ("agent", "preset", "env", "delay", "protocol")}
         options = {"hyperparameters": values_of(self.agent), "schedule": values_of(self.schedule)}
         return names | {"privileged": self.agent.privileged} | options
 
     def min_episode_steps(self, spec: Spec) -> int:
-        """Steps that must follow in an episode before one can be sampled, itself included (see `replay.append`)."""
+        """Return how many steps of an episode must be stored, from a step on, before that step can be sampled."""
         return self.agent.ahead(spec) if self.protocol.last_starts == "dropped" else 1
 
     def cell_id(self, seeds: Sequence[int]) -> str:

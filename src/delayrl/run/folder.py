@@ -23,10 +23,10 @@ from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, save_arrays
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
 from delayrl.run.disk import disk_errors, draft, remove, write_file, write_flushed
-from delayrl.run.rows import CONDITION
 
 FORMAT = 1
-CONFIG: dict[str, Any] = {"format": int, **CONDITION, "hyperparameters": dict, "schedule": dict}
+NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
+CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 FILES = ("rows.jsonl", "metrics.jsonl", "curve.png", "delays.png", "config.json")
@@ -132,8 +132,6 @@ class Run:
         final = self.path / "checkpoints" / f"{step:012d}"
         with disk_errors(self.path):
             final.parent.mkdir(parents=True, exist_ok=True)
-            if final.exists():
-                _delete_checkpoint(final)
             with draft(final) as folder:
                 folder.mkdir()
                 files = {"agent.safetensors": save_arrays(folder / "agent.safetensors", agent)}
@@ -141,6 +139,8 @@ class Run:
                     files["loop.safetensors"] = save_arrays(folder / "loop.safetensors", loop)
                 manifest = {"step": step, "complete": complete, "files": files, "pieces": pieces}
                 write_flushed(folder / "manifest.json", json.dumps(manifest).encode())
+                if final.exists():  # only now is there another for this step
+                    _delete_checkpoint(final)
         self._drop_checkpoints(2)
 
     def finish(self) -> None:
@@ -166,7 +166,7 @@ class Run:
                 file.unlink(missing_ok=True)
 
     def _drop_checkpoints(self, kept: int) -> None:
-        abandoned = (self.path / "checkpoints").glob(".*.draft")  # by a process that was killed
+        abandoned = (self.path / "checkpoints").glob(".*draft")  # by a process that was killed
         for old in [*checkpoint_folders(self.path)[kept:], *abandoned]:
             shutil.rmtree(old, ignore_errors=True)
 

@@ -11,10 +11,7 @@ import jax.numpy as jnp
 
 
 def commit() -> str | None:
-    """Return the commit of the checkout that the package lies in, marked if files differ from it; else None.
-
-    A package that is installed into a folder of another project's checkout is not in that checkout.
-    """
+    """Return the commit of the package's own checkout, marked if files of the package differ from it; else None."""
     package = Path(__file__).parents[1]
 
     def git(*words: str) -> str:

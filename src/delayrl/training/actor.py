@@ -14,7 +14,7 @@ from delayrl.wrappers import Delayed
 
 
 class Actor:
-    """One seed's environment in its current episode: its number, and the actions taken in it so far."""
+    """One seed's environment, the number of its current episode, and the actions taken in that so far."""
 
     seen: Seen
     truth: NDArray[np.float32]  # the true observation now, [S]

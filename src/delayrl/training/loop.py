@@ -33,7 +33,7 @@ METRICS_EVERY = 1000
 def run(
     group: Group, state: TrainState, note: Callable[[str], None], *, progress: bool = False, track: str | None = None
 ) -> None:
-    """Train from a state, which is used up, to the end; and draw the learning curves.
+    """Train from a state to the last step, changing it, and draw the learning curves.
 
     Raises:
         StoppedError: the process was asked to stop; the newest step is stored.
@@ -41,14 +41,14 @@ def run(
     """
     steps = group.setup.schedule.steps
     if state.step < steps:
-        recorder = Recorder(group, state.learner.agent, state.actors[0].env, track)
+        loop = Loop(group, state, Recorder(group, state.learner.agent, state.actors[0].env, track))
         if progress:
             note(f"estimate: {estimate(group, state)}")
         interval = 0.5 if sys.stderr.isatty() else 30
         options = {"disable": not progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
         bar = tqdm(total=steps, initial=state.step, unit="step", **options)
         with stop_signal() as stop, bar:
-            Loop(group, state, recorder).train(stop.is_set, bar)
+            loop.train(stop.is_set, bar)
     for folder in group.runs:
         curve(folder.read("rows"), folder.path / "curve.png")
 
@@ -60,11 +60,11 @@ class Loop:
         self.group, self.state, self._recorder = group, state, recorder
         self._metrics: Metrics = {}
         self._learning = False
+        self._began, self._began_step = time.perf_counter(), state.step
 
     def train(self, stopped: Callable[[], bool], bar: Any) -> None:
         """Train until the last step, or until `stopped()`."""
         schedule, state = self.group.setup.schedule, self.state
-        began, began_step = time.perf_counter(), state.step
         while state.step < schedule.steps:
             if stopped():
                 self.state = save(self.group, state)
@@ -72,7 +72,7 @@ class Loop:
             self.step()
             bar.update(1)
             if state.step % METRICS_EVERY == 0:
-                speed = (state.step - began_step) / (time.perf_counter() - began)
+                speed = (state.step - self._began_step) / (time.perf_counter() - self._began)
                 self._recorder.log(state.step, self._metrics, speed)
             if state.step % schedule.evaluate_every == 0 or state.step == schedule.steps:
                 self.choose()  # before learning, as at every other step

@@ -53,7 +53,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
             run.rewind(-1)
         return state
     newest = checkpoints[0]
-    note(f"{'found complete' if newest.complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
+    note(f"{'already complete' if newest.complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
     state = restore(group, state, checkpoints)
     for run in runs:
         run.rewind(newest.step)

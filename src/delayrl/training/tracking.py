@@ -1,4 +1,4 @@
-"""Scalars to TensorBoard or Weights & Biases as well, where the user asked for it; the run folder has them anyway."""
+"""Optional logging of scalars to TensorBoard or Weights & Biases. The run folder always has them."""
 
 from pathlib import Path
 from typing import Any

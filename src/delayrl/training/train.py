@@ -79,13 +79,15 @@ def train(
     numbers = list(range(seed, seed + seeds))
     runs = run_folders(setup.condition, numbers, out)
     observed = setup.delay.observed()
-    actors = [Actor(make(env, observed, rescale=True), n, setup.agent.privileged, setup.protocol) for n in numbers]
-    spec = spec_of(actors[0].env)
-    shapes = check_fit(setup.agent, setup.schedule, actors[0].env)  # before anything is stored
+    envs = [make(env, observed, rescale=True) for _ in numbers]
+    spec = spec_of(envs[0])
+    shapes = check_fit(setup.agent, setup.schedule, envs[0])  # before anything is stored
     if device != "gpu":
         keep_buffers(setup.agent, spec, seeds)  # before JAX looks for its devices
     precision = PRODUCTS[setup.schedule.precision]
     with ThreadPoolExecutor(threads) as pool, on_device(device), jax.default_matmul_precision(precision):
+        privileged, rules = setup.agent.privileged, setup.protocol
+        actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.min_episode_steps(spec))
         group = Group(setup, numbers, runs, keys, spec, shapes, program, pool.map if threads > 1 else map)

@@ -40,12 +40,17 @@ def seconds_of(env: Any) -> float | None:
     return None
 
 
-def history_rows(env: Any, delay: Delay, history: int | None) -> int:
-    """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
-    limit = env.spec.max_episode_steps if env.spec is not None else None
+def check_length(delay: Delay, spec: Any) -> None:
+    """Raise DelayRLError if a delay is no shorter than an episode of the task with this spec (None: unknown)."""
+    limit = spec.max_episode_steps if spec is not None else None
     longest = max(delay.maximum, delay.reward.maximum)
     if limit is not None and longest >= limit:
-        raise DelayRLError(f"a delay of {longest} steps is no shorter than an episode of {name_of(env)} ({limit})")
+        raise DelayRLError(f"a delay of {longest} steps is no shorter than an episode of {spec.id} ({limit} steps)")
+
+
+def history_rows(env: Any, delay: Delay, history: int | None) -> int:
+    """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
+    check_length(delay, env.spec)
     if history is None:
         return delay.maximum
     if whole_steps(history) < delay.maximum:

@@ -16,7 +16,7 @@ from typing import Any
 from delayrl.bench.backends.local import read_outcome, start_worker
 from delayrl.bench.runner import PAUSE
 from delayrl.bench.worker import Outcome
-from delayrl.errors import DelayRLError, first_line
+from delayrl.errors import DelayRLError, described, first_line
 from delayrl.run.cell import Cell
 
 TIMEOUT = 5.0
@@ -95,7 +95,7 @@ class RayBackend:
             try:
                 outcome = Outcome(*self._ray.get(answer))
             except self._ray.exceptions.RayError as error:
-                outcome = Outcome("died", f"{type(error).__name__}: {first_line(error)}")
+                outcome = Outcome("died", described(error))
             del self.running[cell.id]
             self._ray.kill(actor)
             ended.append((cell, outcome))

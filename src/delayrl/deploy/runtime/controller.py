@@ -182,7 +182,7 @@ class Controller:
 
         Raises:
             DelayRLError: no observation yet, or the policy's action is not finite. Nothing is recorded.
-            ClockError: `now` is not after the last call, or before the newest observation. Nothing is recorded.
+            ClockError: `now` is not after the last call, or more than half a period before the newest observation.
             OverrunError: with `on_overrun="raise"`. Only the overrun is counted.
         """
         policy, limit = self.policy, self.policy.max_age
