@@ -1,0 +1,85 @@
+"""Run folders and their checkpoints: what is good stays, what is broken is named in one line."""
+
+import errno
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from delayrl.errors import DelayRLError
+from delayrl.run.folder import Run
+
+WEIGHTS = {"w": np.ones(3, np.float32)}
+LOOP = {"rows": np.int32(1)}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    run = Run(tmp_path / "run")
+    run.create({"agent": "sac", "preset": "small", "env": "E", "delay": 0, "hyperparameters": {}, "schedule": {}})
+    run.save(100, WEIGHTS, LOOP, {})
+    return run
+
+
+def test_a_checkpoint_of_the_same_step_is_replaced_only_when_complete(run: Run, monkeypatch) -> None:
+    """A run that is stopped right after an evaluation saves its step twice."""
+    run.save(100, {"w": np.zeros(3, np.float32)}, LOOP, {})
+    assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DelayRLError, match="the disk is full; what was stored before is kept"):
+        run.save(100, WEIGHTS, LOOP, {})
+    assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
+
+
+def test_drafts_that_a_killed_process_left_are_deleted(run: Run) -> None:
+    home = run.path / "checkpoints"
+    for name in (".draft", ".000000000150.draft"):  # of version 0.1, and of today
+        (home / name).mkdir()
+    run.save(200, WEIGHTS, LOOP, {})
+    assert sorted(path.name for path in home.iterdir()) == ["000000000100", "000000000200"]
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        ({"step": 101}, "its manifest is damaged"),
+        ({"step": float("inf")}, "its manifest is damaged"),
+        ({"files": {}}, "its manifest is damaged"),
+        ({"files": {"loop.safetensors": ""}}, "its manifest is damaged"),
+        ({"pieces": {"../agent.safetensors": ""}}, "is cut or changed"),
+        ({"pieces": {"a\0b": ""}}, "is cut or changed"),
+        ({"pieces": 3}, "its manifest is damaged"),
+    ],
+)
+def test_a_damaged_manifest_is_one_line(damage: dict, words: str, run: Run) -> None:
+    run.save(200, WEIGHTS, LOOP, {})
+    file = run.path / "checkpoints" / "000000000200" / "manifest.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | damage))
+    good, (line,) = run.checkpoints()
+    assert [checkpoint.step for checkpoint in good] == [100]
+    assert words in line
+    run.drop_pieces()
+    assert run.latest().step == 100
+
+
+def test_a_copy_of_a_checkpoint_is_left_out(run: Run) -> None:
+    home = run.path / "checkpoints"
+    shutil.copytree(home / "000000000100", home / "000000000100.bak")
+    assert run.latest().step == 100
+    run.drop_pieces()
+
+
+@pytest.mark.parametrize("name", ["agent", "delay", "schedule"])
+def test_a_damaged_configuration_is_one_line(name: str, run: Run) -> None:
+    config = run.config
+    assert "protocol" not in config  # none is needed to open a run
+    (run.path / "config.json").write_text(json.dumps({key: value for key, value in config.items() if key != name}))
+    with pytest.raises(DelayRLError, match=f"no {name}"):
+        print(run.config)
