@@ -13,6 +13,7 @@ import argparse
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -54,7 +55,10 @@ RUNS: dict[str, list[str]] = {
     "bpql-lockstep": ["bpql", "--delay", "3", "--seeds", "2", *SAC],
     "vdpo-blocks": ["vdpo", "--delay", "3", "--updates-per-call", "4", *SAC, *VDPO],
     "vdpo-stopped": ["vdpo", "--delay", "3", "--seed", "5", *SAC, *VDPO],
+    "bpql-stopped": ["bpql", "--delay", "3", "--seeds", "2", "--updates-per-call", "4", *SAC],
 }
+STOPS = {"vdpo-stopped": 150, "bpql-stopped": 301}
+"""Stopped once their environments have taken that many steps together, in the middle of a block, then resumed."""
 DELAYS = (
     "0",
     "3",
@@ -120,11 +124,12 @@ def reopen(folder: Path) -> None:
     before, after = facts_of(folder), dict[str, Any]()
     for name in RUNS:
         after[name] = before[name] | use(folder / "runs" / name, name)
-    resumed = folder / "resumed"
-    shutil.rmtree(resumed, ignore_errors=True)
-    shutil.copytree(folder / "stopped", resumed)
-    delayrl("train", *RUNS["vdpo-stopped"], *common(resumed))
-    after["vdpo-stopped"] |= result(resumed)
+    for name in STOPS:
+        resumed = folder / "resumed" / name
+        shutil.rmtree(resumed, ignore_errors=True)
+        shutil.copytree(folder / "stopped" / name, resumed)
+        delayrl("train", *RUNS[name], *common(resumed))
+        after[name] |= results(resumed)
     after |= {table: report(folder, table) for table in TABLES}
     compare({name: before[name] for name in after}, after)
 
@@ -155,39 +160,48 @@ def common(out: Path) -> list[str]:
 
 
 def train(out: Path, name: str) -> dict[str, Any]:
-    """Train one of RUNS (the last is stopped on its way and resumed); everything that it wrote, as digests."""
-    if name == "vdpo-stopped":
+    """Train one of RUNS; everything that it wrote, as digests."""
+    if name in STOPS:
         subprocess.run([sys.executable, __file__, "stop", str(out)], check=False, env=quiet())
-        shutil.copytree(out, out.parent.parent / "stopped")
+        (newest,) = sorted(next(iter(sorted(out.glob("seed*"))), out).glob("checkpoints/*/manifest.json"))[-1:]
+        if json.loads(newest.read_text())["complete"]:
+            raise SystemExit(f"{name} was to be stopped, but it is complete")
+        shutil.copytree(out, out.parent.parent / "stopped" / name)
     delayrl("train", *RUNS[name], *common(out))
-    seeds = sorted(out.glob("seed*")) or [out]
-    facts: dict[str, Any] = {}
-    for number, run in enumerate(seeds):
-        facts |= {f"{key} {number}" if number else key: value for key, value in result(run).items()}
-    return facts | use(out, name)
+    return results(out) | use(out, name)
 
 
 def stop(out: Path) -> None:
-    """Train, and send this process SIGTERM once its first checkpoint is there."""
+    """Train, and send this process SIGTERM in the middle of a step."""
     import signal
-    import threading
-    import time
-
-    def watch() -> None:
-        while not (out / "checkpoints" / "000000000160" / "manifest.json").exists():
-            time.sleep(0.001)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, daemon=True).start()
-    sys.argv = ["delayrl", "train", *RUNS["vdpo-stopped"], *common(out)]
     from importlib.metadata import entry_points
+
+    from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+
+    step, count = InvertedPendulumEnv.step, 0
+
+    def counted(self: Any, action: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == STOPS[out.name]:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self, action)
+
+    InvertedPendulumEnv.step = counted
+    sys.argv = ["delayrl", "train", *RUNS[out.name], *common(out)]
 
     (command,) = entry_points(group="console_scripts", name="delayrl")
     command.load()()
 
 
+def results(out: Path) -> dict[str, Any]:
+    """What the finished runs of all seeds hold."""
+    seeds = sorted(out.glob("seed*")) or [out]
+    return {f"{key} {i}": value for i, run in enumerate(seeds) for key, value in result(run).items()}
+
+
 def result(run: Path) -> dict[str, Any]:
-    """Configuration, rows, metrics and weights of a finished run. Weights are compared whatever they are called."""
+    """Configuration, rows, metrics and weights of a finished run, whose optimiser states were once called memory."""
     config = json.loads((run / "config.json").read_text())
     metrics = (
         [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -195,12 +209,13 @@ def result(run: Path) -> dict[str, Any]:
         else []
     )
     (weights,) = run.glob("checkpoints/*/agent.safetensors")
-    arrays = load_file(weights).values()
+    names = re.compile(r"(?<![^.])((?:\w+_)?)memory(?![^.])")
+    arrays = {names.sub(r"\1opt_state", name): array for name, array in load_file(weights).items()}
     return {
         "config": {key: value for key, value in config.items() if key != "versions"},
         "rows": (run / "rows.jsonl").read_text(),
         "metrics": [{k: v for k, v in line.items() if k != "steps_per_second"} for line in metrics],
-        "weights": sorted(digest(f"{x.dtype}{x.shape}".encode() + x.tobytes()) for x in arrays),
+        "weights": {name: digest(f"{x.dtype}{x.shape}".encode() + x.tobytes()) for name, x in sorted(arrays.items())},
     }
 
 

@@ -34,8 +34,10 @@ from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.delays import Delay  # noqa: E402
 from delayrl.envs import make  # noqa: E402
+from delayrl.run.folder import Run  # noqa: E402
 from delayrl.training.actor import Actor  # noqa: E402
 from delayrl.training.learner import Learner, Program, Stored  # noqa: E402
+from short_runs import train  # noqa: E402
 
 TINY_SAC = SAC(hidden=(16, 16), batch_size=16)
 TINY = {
@@ -58,6 +60,12 @@ def few_memory_maps() -> Iterator[None]:
     if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(scope="session")
+def vdpo(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A short run."""
+    return train("vdpo", tmp_path_factory.mktemp("runs") / "vdpo")
 
 
 @pytest.fixture

@@ -135,7 +135,7 @@ def test_who_acts() -> None:
 def test_it_asks_for_what_it_needs() -> None:
     with pytest.raises(DelayRLError, match="at least 1 step"):
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
-    with pytest.raises(DelayRLError, match="whole rounds of 10 steps; got 25"):
+    with pytest.raises(DelayRLError, match="a multiple of round_steps = 10; got 25"):
         dataclasses.replace(AGENT, expert_steps=25).init(SPEC, jax.random.key(0))
 
 

@@ -185,6 +185,7 @@ BAD = [
     (BASIC.replace("[2, 3]", "[2.5]"), "whole environment steps"),
     (BASIC.replace("[2, 3]", "[[2]]"), "delays cannot hold [2]"),
     (BASIC.replace("[2, 3]", "[50]"), "no shorter than an episode"),
+    (BASIC.replace("[2, 3]", '["2+reward=60"]'), "no shorter than an episode"),
     (BASIC.replace("[2, 3]", "3"), "delays must be a list"),
     (BASIC.replace('"bpql"', '"sac"'), "delay-free reference"),
     (BASIC + "[overrides]\nbatch_sise = 3\n", "did you mean batch_size"),

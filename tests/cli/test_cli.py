@@ -125,6 +125,8 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train vdpo --env Reacher-v5 --delay 3 --learning-rate high", "invalid float"),
         ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
         ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
+        ("bench run first --wrokers 2", "unexpected '--wrokers 2' (see"),
+        ("evaluate run --episode-count 2", "did you mean --episodes"),
         ("evaluate nowhere", "not a run folder"),
         ("evaluate nowhere --episods 3", "did you mean --episodes"),
         ("watch nowhere --out x.gif", "not a run folder"),

@@ -243,3 +243,11 @@ def test_values_that_are_no_delay() -> None:
             as_delay(given_)  # type: ignore[arg-type]
     with pytest.raises(DelayRLError, match="constant delay"):
         as_delay("action=uniform:0:3").observed()
+
+
+def test_laws_take_arrays() -> None:
+    assert Choice(np.array([1, 2]), np.array([0.5, 0.5])) == Choice((1, 2), (0.5, 0.5))
+    assert Markov(np.array([1, 2]), np.eye(2)) == Markov((1, 2), ((1, 0), (0, 1)))
+    for empty in (lambda: Choice((), ()), lambda: Recorded(())):
+        with pytest.raises(DelayRLError, match="at least one"):
+            empty()

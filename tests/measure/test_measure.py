@@ -19,7 +19,7 @@ from delayrl.cli.main import main
 from delayrl.cli.measure import seconds
 from delayrl.envs import quiet
 from delayrl.measure import from_log, probe
-from delayrl.measure.log import whole_steps
+from delayrl.measure.log import rounded_up_steps
 from delayrl.wrappers import AugmentedObservation, Delayed
 
 ROOT = Path(__file__).parents[2]
@@ -409,8 +409,8 @@ def test_period_and_rounding(tmp_path: Path) -> None:
     assert [from_log(path, period).step for period in (0.02, 0.04, 0.07, 0.14, 1.0)] == [7, 4, 2, 1, 1]
     for steps in range(200):
         for period in (0.02, 0.001, 1 / 30, 7.3):
-            assert whole_steps(steps * period, period) == steps
-            assert whole_steps((steps + 0.01) * period, period) == steps + 1
+            assert rounded_up_steps(steps * period, period) == steps
+            assert rounded_up_steps((steps + 0.01) * period, period) == steps + 1
     times = {"20ms": 0.02, "0.02": 0.02, "50Hz": 0.02, "2e-2s": 0.02, "15 s": 15.0, "500us": 5e-4}
     assert {text: seconds("period", text) for text in times} == pytest.approx(times)
 

@@ -20,6 +20,8 @@ from delayrl.report.rows import group_rows
         ({"episode": -1}, "damaged"),
         ({"delay": 10**30}, "damaged"),
         ({"delay": [5]}, "damaged"),
+        ({"delay": True}, "damaged"),
+        ({"delay": 2**31}, "damaged"),
         ({"policy": {}}, "damaged"),
         ({"episode": 1, "step": 100}, "twice"),
     ],

@@ -2,10 +2,13 @@
 
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
 import pytest
 
 from delayrl.run import provenance
+from delayrl.run.provenance import versions
 
 
 @pytest.mark.parametrize("place", ["training/loop.py", "run/provenance.py", "new.py"])
@@ -35,3 +38,11 @@ def test_a_package_outside_of_a_checkout_has_no_commit(tmp_path: Path, monkeypat
     (tmp_path / "run").mkdir()
     monkeypatch.setattr(provenance, "__file__", str(tmp_path / "run" / "provenance.py"))
     assert provenance.commit() is None
+
+
+def test_the_device_that_is_written_down_is_the_one_in_use(monkeypatch) -> None:
+    """`--device cpu` where there is a GPU too."""
+    cpu = jax.devices("cpu")[0]
+    monkeypatch.setattr(jax, "devices", lambda *_: [SimpleNamespace(device_kind="GPU")])
+    with jax.default_device(cpu):
+        assert versions()["device"] == "cpu"

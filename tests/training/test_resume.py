@@ -1,5 +1,6 @@
 """A run killed at any moment and resumed is the uninterrupted one, bit for bit: rows, parameters, optimisers."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,9 +13,12 @@ import pytest
 from killing import KilledError, moments, options
 
 import delayrl
+from delayrl.agents.registry import AGENTS
 from delayrl.run.folder import Run
+from delayrl.training.actor import Actor
+from short_runs import arrays, train
 
-AGENTS = ("sac", "bpql", "vdpo")
+KILLED = ("sac", "bpql", "vdpo")
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +63,13 @@ def die(agent: str, out: Path, now: Callable[[int, str, str], bool]) -> bool:
 
 
 @pytest.mark.parametrize("trial", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 8))])
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", KILLED)
 def test_killed_at_random_moments(agent: str, trial: int, tmp_path: Path, whole) -> None:
     """Several times in a row, half of them while something is written or deleted."""
     runs, found = whole(agent)
     disk = [number for number, what in enumerate(found, 1) if what != "step"]
     assert len(disk) > 100
-    rng = np.random.default_rng([trial, AGENTS.index(agent)])
+    rng = np.random.default_rng([trial, KILLED.index(agent)])
     for _ in range(4):
         moment = int(rng.choice(disk) if rng.random() < 0.5 else rng.integers(1, len(found) + 1))
         if die(agent, tmp_path / "cut", lambda number, *_, moment=moment: number == moment):
@@ -99,8 +103,97 @@ def test_sigkill(tmp_path: Path, whole) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trial", range(4))
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", KILLED)
 def test_sigkill_at_random_moments(agent: str, trial: int, tmp_path: Path, whole) -> None:
     runs, found = whole(agent)
     moment = np.random.default_rng([trial, 7]).integers(1, len(found) + 1)
     sigkilled(agent, int(moment), tmp_path / "cut", runs)
+
+
+@pytest.mark.parametrize(
+    ("agent", "at", "protocol"),
+    [("bpql", 260, "official"), *((agent, 237, "corrected") for agent in AGENTS)],
+)
+def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str, tmp_path: Path, monkeypatch) -> None:
+    """Bit for bit: rows and parameters, with a replay that has gone round, and an episode cut in its middle."""
+    whole = train(agent, tmp_path / "whole", protocol=protocol)
+    step = Actor.step
+    calls = 0
+
+    def dying(self, action):
+        nonlocal calls
+        calls += 1
+        if calls == at:
+            raise KilledError
+        return step(self, action)
+
+    monkeypatch.setattr(Actor, "step", dying)
+    with pytest.raises(KilledError):
+        train(agent, tmp_path / "cut", protocol=protocol)
+    monkeypatch.setattr(Actor, "step", step)
+    run = Run(tmp_path / "cut")
+    assert run.latest().step == at // 100 * 100
+    run.append("rows", [{"step": 299, "policy": "agent", "return": 0.0}])  # made after the checkpoint
+    with open(run.path / "rows.jsonl", "a") as file:
+        file.write('{"step": 299, "pol')
+    resumed = train(agent, tmp_path / "cut", protocol=protocol)
+    assert resumed.read("rows") == whole.read("rows")
+    for name, array in arrays(resumed).items():
+        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert not (run.path / "replay").exists()
+
+
+@pytest.mark.parametrize(("agent", "block"), [("bpql", 1), ("bpql", 4), ("vdpo", 10)])
+def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_path: Path, monkeypatch) -> None:
+    """A run that is asked to stop keeps its newest steps and goes on with them, bit for bit."""
+    values = {"updates_per_call": block}
+    whole = train(agent, tmp_path / "whole", **values)
+    step, calls = Actor.step, 0
+
+    def interrupted(self, action):
+        nonlocal calls
+        calls += 1
+        if calls == 157:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, action)
+
+    monkeypatch.setattr(Actor, "step", interrupted)
+    with pytest.raises(delayrl.DelayRLError, match="stopped at step 157"):
+        train(agent, tmp_path / "cut", **values)
+    assert len(Run(tmp_path / "cut").latest().arrays("loop")["pending.obs"]) == (157 - 1) % block + 1
+    resumed = train(agent, tmp_path / "cut", **values)
+    assert resumed.read("rows") == whole.read("rows")
+    for name, array in arrays(resumed).items():
+        np.testing.assert_array_equal(array, arrays(whole)[name])
+
+
+def test_broken_checkpoint_falls_back(tmp_path: Path, monkeypatch) -> None:
+    """A cut file is named, and the checkpoint before it is used; with none left the run says so."""
+    step, calls = Actor.step, 0
+
+    def dying(self, action):
+        nonlocal calls
+        calls += 1
+        if calls == 250:
+            raise KilledError
+        return step(self, action)
+
+    monkeypatch.setattr(Actor, "step", dying)
+    with pytest.raises(KilledError):
+        train("bpql", tmp_path / "run")
+    monkeypatch.setattr(Actor, "step", step)
+    run = Run(tmp_path / "run")
+    newest = run.latest().path / "agent.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-100])
+    good, broken = run.checkpoints()
+    assert [c.step for c in good] == [100]
+    assert "agent.safetensors is cut or changed" in broken[0]
+    backup = tmp_path / "backup"
+    shutil.copytree(run.path, backup)
+    whole = train("bpql", tmp_path / "whole")
+    assert train("bpql", run.path).read("rows") == whole.read("rows")
+    (Run(backup).latest().path / "manifest.json").write_text("{")
+    with pytest.raises(delayrl.DelayRLError, match="no good checkpoint"):
+        train("bpql", backup)
+    with pytest.raises(delayrl.DelayRLError, match="broken"):
+        delayrl.load(backup)

@@ -1,0 +1,57 @@
+"""A loaded policy acts in the task's units, and refuses what it was not trained for."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import delayrl
+from delayrl.play.evaluation import evaluate
+from delayrl.run.folder import Run
+from short_runs import train
+
+
+def test_load_and_act(vdpo: Run) -> None:
+    """The loaded policy, in the task's own units, plays what evaluation played."""
+    policy = delayrl.load(vdpo.path)
+    result = evaluate(vdpo.path, episodes=2, seed=5)
+    from delayrl.play.evaluation import HELD_OUT, reset_seed
+
+    env = delayrl.make("Reacher-v5", delay=3)
+    for episode in range(2):
+        obs, info = env.reset(seed=reset_seed(5, HELD_OUT, episode))
+        total, done = 0.0, False
+        while not done:
+            obs, reward, terminated, truncated, info = env.step(policy.act(obs, info))
+            total += float(reward)
+            done = terminated or truncated
+        np.testing.assert_allclose(total, result["returns"][episode], rtol=1e-3)
+
+
+def test_policy_in_other_units(tmp_path: Path) -> None:
+    """Pendulum's actions lie in ±2: `act` takes and gives them so."""
+    run = train("bpql", tmp_path / "run", env="Pendulum-v1", steps=150)
+    policy = delayrl.load(run.path)
+    env, scaled = delayrl.make("Pendulum-v1", 3), delayrl.make("Pendulum-v1", 3, rescale=True)
+    (obs, info), (obs2, info2) = env.reset(seed=1), scaled.reset(seed=1)
+    from delayrl.core.views import seen_now
+
+    for _ in range(6):
+        action = policy.act(obs, info)
+        seen = seen_now(obs2, info2, 3, privileged=False)
+        inner = np.asarray(policy.agent.act(policy.state, seen, jax.random.key(0), explore=False))
+        np.testing.assert_allclose(action, 2 * inner, atol=1e-4)
+        obs, _, _, _, info = env.step(action)
+        obs2, _, _, _, info2 = scaled.step(inner)
+
+
+def test_policy_refuses_what_it_does_not_know(vdpo: Run) -> None:
+    policy = delayrl.load(vdpo.path)
+    obs, actions = np.zeros(10), np.zeros((9, 2))
+    with pytest.raises(delayrl.DelayRLError, match=r"ages 0\.\.3"):
+        policy.act(obs, {"age": 4, "actions": actions})
+    with pytest.raises(delayrl.DelayRLError, match="size 10"):
+        policy.act(obs[:4], {"age": 1, "actions": actions})
+    with pytest.raises(delayrl.DelayRLError, match="needs the 3 actions"):
+        policy.act(obs, {"age": 3, "actions": actions[:2]})
