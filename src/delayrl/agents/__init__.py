@@ -1,1 +1,1 @@
-"""The agents, one file each; the registry names them."""
+"""The agents, one file each, and the registry that lists them."""

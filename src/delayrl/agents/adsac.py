@@ -1,11 +1,11 @@
 """Auxiliary-delayed SAC (Wu et al., "Boosting reinforcement learning with strongly delayed feedback", ICML 2024).
 
-Idea: values of the augmented state x_t are hard to learn, since it grows with the delay Δ. So learn them for a shorter,
-auxiliary delay τ < Δ, together with an actor that acts under τ; and improve the actor that must live with Δ by those
-values. The critics' target is the lower of the two actors' values, each from one of the two target critics.
+Idea: the augmented state x_t grows with the delay Δ, so its values are hard to learn. AD-SAC learns values for a
+shorter, auxiliary delay τ < Δ, together with an actor for τ, and improves the actor for Δ with those values. The
+critics' target is the lower of the two actors' values, each from one of the two target critics.
 
-Views: the augmented actor sees x_t; the auxiliary actor and the critics see x^τ_t, which for τ = 0 is s_t. While it
-trains, its behaviour reads s_t (privileged) where τ = 0, unless `behaviour="augmented"`; for τ > 0 it does not.
+Views: the augmented actor sees x_t; the auxiliary actor and the critics see x^τ_t, which is s_t for τ = 0. With τ = 0,
+training is privileged (the behaviour reads s_t) unless `behaviour="augmented"`; with τ > 0 it is not.
 
 Deviations from the paper and from the released code are numbered in docs/algorithms/ad-sac.md.
 """
@@ -30,7 +30,7 @@ Behaviour = Literal["lower-q", "augmented"]
 
 
 class State(NamedTuple):
-    """The auxiliary learner, with the critics; and beside it the augmented actor, with a temperature of its own."""
+    """The auxiliary learner with the shared critics, and the augmented actor with its own temperature."""
 
     auxiliary: sac.State
     actor: Params
@@ -40,7 +40,7 @@ class State(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What both actors see at the same step."""
+    """The inputs of both actors at the same step."""
 
     auxiliary: Float[Array, "batch short"]
     augmented: Float[Array, "batch long"]
@@ -48,32 +48,35 @@ class Inputs(NamedTuple):
 
 @dataclass(frozen=True)
 class ADSAC:
-    """Hyperparameters; the defaults are the released code's."""
+    """The AD-SAC agent. Its hyperparameters default to the released code's."""
 
     learner: sac.SAC = field(default_factory=lambda: sac.SAC(actor_sees="augmented", critic_sees="augmented"))
-    auxiliary_delay: Annotated[int, "τ: the delay for which values are learned, at most the task's"] = 0
-    behaviour: Annotated[Behaviour, "who acts in training: the sample with the lower Q (τ = 0), or that"] = "lower-q"
-    evaluation: Annotated[Literal["mode", "sample"], "which action is evaluated; the released code samples"] = "mode"
+    auxiliary_delay: Annotated[int, "τ: delay for which values are learned, at most the task's delay"] = 0
+    behaviour: Annotated[
+        Behaviour,
+        "who acts in training: augmented, or lower-q (for τ = 0, the actor with the lower Q; else augmented)",
+    ] = "lower-q"
+    evaluation: Annotated[Literal["mode", "sample"], "action in evaluation; the released code samples"] = "mode"
 
     @property
     def privileged(self) -> bool:
-        """The auxiliary actor needs the true state to act; a state of age τ > 0 is not shown to anyone."""
+        """Whether the auxiliary actor may act in training. It needs s_t; its input for τ > 0 is not available."""
         return self.behaviour == "lower-q" and self.auxiliary_delay == 0
 
     def ahead(self, spec: Spec) -> int:
-        """k-step targets, as SAC's."""
+        """Return the longest k of the k-step targets."""
         return self.learner.ahead(spec)
 
     def phases(self) -> tuple[Phase, ...]:
-        """One: the update."""
+        """Return one phase, the update."""
         return (self.learner.phases()[0]._replace(update=self.update),)
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """The auxiliary actor, where it is free of delay."""
+        """Return the auxiliary actor if it is delay-free (τ = 0)."""
         return (self.learner, state.auxiliary) if self.auxiliary_delay == 0 else None
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Fresh networks: SAC's for the delay τ, and an actor for the task's."""
+        """Initialise SAC for the auxiliary delay τ, and an actor for the task's delay."""
         if self.auxiliary_delay > spec.delay:
             raise DelayRLError(
                 f"ad-sac's auxiliary_delay must be no longer than the delay {spec.delay}; got {self.auxiliary_delay}"
@@ -84,7 +87,7 @@ class ADSAC:
         return State(auxiliary, own.actor, own.log_temperature, own.actor_opt_state, own.temperature_opt_state)
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """The augmented actor; in training, who acts is what `behaviour` says."""
+        """Return the augmented actor's action; in training, `behaviour` decides which actor acts."""
         auxiliary_key, augmented_key = jax.random.split(key)
         policy = self.learner.policy(state.actor, network_input(seen, "augmented"))
         augmented, _ = networks.sample(policy, augmented_key)
@@ -98,11 +101,11 @@ class ADSAC:
         return networks.lower_q(state.auxiliary.critic, truth, auxiliary, augmented)
 
     def deterministic(self, state: State) -> Deterministic:
-        """The augmented actor, its mode: also where `evaluation` samples."""
+        """Return the augmented actor. Its action is the mode, even if `evaluation` samples."""
         return Deterministic("augmented", state.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """One critic update; every `actor_every`-th time rounds of a coin's choice of actor, and both temperatures."""
+        """Update the critics and, every `actor_every`-th time, randomly chosen actors and both temperatures."""
         auxiliary_key, augmented_key, actor_key = jax.random.split(key, 3)
         now, later = self.inputs(windows, 0), self.inputs(windows, windows.n_step)
         temperatures = {
@@ -122,7 +125,7 @@ class ADSAC:
     def next_value(
         self, state: State, later: Inputs, auxiliary_key: Key, augmented_key: Key
     ) -> tuple[Float[Array, " batch"], Metrics]:
-        """V(x^τ_{t+k}): the minimum over pairs of an actor and a target critic; and the entropies of the actors.
+        """Return V(x^τ_{t+k}), the minimum over two pairs of actor and target critic, and the actors' entropies.
 
         min( Q̄_1(x^τ, a^τ) - α_τ log π_τ(a^τ|x^τ),  Q̄_2(x^τ, a) - α log π(a|x) ),  a^τ ~ π_τ(·|x^τ), a ~ π(·|x).
         """
@@ -139,7 +142,7 @@ class ADSAC:
         return jnp.minimum(*values), {"auxiliary_entropy": entropies[0], "entropy": entropies[1]}
 
     def inputs(self, windows: Window, ahead: int | Array) -> Inputs:
-        """x^τ and x, `ahead` steps after t, for each window."""
+        """Return x^τ and x at `ahead` steps after t, for each window."""
 
         def of_window(window: Window, k: Array) -> Inputs:
             pair = (view(window, k, delay) for delay in (self.auxiliary_delay, None))
@@ -148,7 +151,7 @@ class ADSAC:
         return jax.vmap(of_window)(windows, jnp.broadcast_to(ahead, windows.n_step.shape))
 
     def _improve(self, state: State, now: Inputs, action_size: int, key: Key) -> State:
-        """Rounds of one actor's improvement, and of both temperatures' adjustment; all by the values of x^τ."""
+        """Improve a randomly chosen actor and both temperatures, `actor_updates` times, with the values of x^τ."""
         for update_key in jax.random.split(key, self.learner.actor_updates):
             coin_key, policy_key, auxiliary_key, augmented_key = jax.random.split(update_key, 4)
             state = jax.lax.cond(
@@ -164,23 +167,23 @@ class ADSAC:
         return state
 
     def improve_auxiliary(self, state: State, now: Inputs, key: Key) -> State:
-        """One step of the auxiliary actor."""
+        """Take one gradient step on the auxiliary actor."""
         return state._replace(auxiliary=self.learner.improve_actor(state.auxiliary, now.auxiliary, now.auxiliary, key))
 
     def improve_augmented(self, state: State, now: Inputs, key: Key) -> State:
-        """One step of the augmented actor."""
+        """Take one gradient step on the augmented actor."""
         return with_augmented(
             state, self.learner.improve_actor(augmented_learner(state), now.augmented, now.auxiliary, key)
         )
 
 
 def augmented_learner(state: State) -> sac.State:
-    """The augmented actor as a learner of SAC's: with the critics that it shares."""
+    """Return the augmented actor and the shared critics as a state of SAC."""
     own = state._asdict()
     del own["auxiliary"]
     return state.auxiliary._replace(**own)
 
 
 def with_augmented(state: State, learner: sac.State) -> State:
-    """The state with what is the augmented actor's own in `learner`."""
+    """Return the state with the augmented actor, its temperature and its optimisers replaced by those of `learner`."""
     return State(state.auxiliary, *(getattr(learner, name) for name in State._fields[1:]))

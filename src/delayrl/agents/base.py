@@ -1,4 +1,4 @@
-"""What an agent is, and what the loop must know of it. Documentation: there is no behaviour here to inherit."""
+"""The interface between agents and the training loop. Agents implement the protocol `Agent`; they inherit nothing."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -17,17 +17,17 @@ Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 PRODUCTS: Mapping[Precision, str] = {
     "float32": "float32",
     "tensorfloat32": "tensorfloat32",
-    "bfloat16": "BF16_BF16_F32",  # what JAX calls bfloat16 is that on a TPU, and tensorfloat32 on a GPU
+    "bfloat16": "BF16_BF16_F32",  # JAX's "bfloat16" is bfloat16 on a TPU, but tensorfloat32 on a GPU
 }
-"""JAX's words for a precision, for `jax.default_matmul_precision`."""
+"""Each precision as `jax.default_matmul_precision` names it."""
 State = Any
-"""An agent's state: a tree of arrays; networks, optimisers, temperatures."""
+"""An agent's state: a pytree of arrays (networks, optimiser states, temperatures)."""
 
 
 class Phase(NamedTuple):
-    """`updates` gradient updates every `every` environment steps, each on a fresh batch of `batch` windows.
+    """A schedule of gradient updates: `updates` of them every `every` environment steps.
 
-    `update(state, windows, key, count)` is pure; `count` numbers the phase's updates from 0 on.
+    Each `update(state, windows, key, count)` is pure and gets a fresh batch of `batch` windows; `count` starts at 0.
     """
 
     every: int
@@ -37,11 +37,11 @@ class Phase(NamedTuple):
 
 
 class Deterministic(NamedTuple):
-    """What gives an agent's deterministic actions, as plain networks: for whoever runs them without the agent.
+    """An agent's deterministic policy as plain networks, for callers that run it without the agent.
 
-    The action is tanh of the first A outputs of `head`, an `mlp`. It reads the observation that is shown, or x_t as
-    `network_input` makes it; or, with an `encoder`, what a `transformer` on x_t gives at the shown age. At age 0
-    `current`, where there is one, acts instead: an `mlp` on the observation.
+    The action is tanh of the first A outputs of `head`, an `mlp`. Its input is the shown observation, or x_t as
+    `network_input` returns it, or, with an `encoder`, the output of that `transformer` on x_t at the shown age. At age
+    0 `current`, an `mlp` on the observation, acts instead if there is one.
     """
 
     sees: Sees
@@ -52,52 +52,52 @@ class Deterministic(NamedTuple):
 
 @runtime_checkable
 class Agent(Protocol):
-    """A frozen dataclass of hyperparameters with pure methods, written for one seed."""
+    """The interface of an agent: a frozen dataclass of hyperparameters with pure methods, written for one seed."""
 
     def __hash__(self) -> int:
-        """Equal hyperparameters share what is compiled."""
+        """Return a hash of the hyperparameters: equal agents share compiled functions."""
 
     @property
     def privileged(self) -> bool:
-        """Whether its behaviour reads the true current state while it trains."""
+        """Whether the behaviour policy reads the true current state in training."""
 
     def ahead(self, spec: Spec) -> int:
-        """How many steps after t its windows reach."""
+        """Return how many steps after t the windows reach."""
 
     def phases(self) -> tuple[Phase, ...]:
-        """What it learns, and when."""
+        """Return the agent's updates, each with its schedule."""
 
-    # An agent whose own schedule must fit the run's also has `check(schedule)`, which raises DelayRLError.
+    # An agent that restricts the run's schedule also has `check(schedule)`, which raises DelayRLError.
 
     def init(self, spec: Spec, key: Key) -> State:
-        """A fresh state. Raises DelayRLError where the agent does not suit the task."""
+        """Return a fresh state. Raises DelayRLError if the agent does not support the task."""
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """An action in [-1, 1]; without `explore` deterministic, and `seen.truth` is None."""
+        """Return an action in [-1, 1]: with `explore` for training, else for evaluation, where `seen.truth` is None."""
 
     def reference_policy(self, state: State) -> "tuple[Agent, State] | None":
-        """The delay-free policy inside it, where there is one: evaluated beside it, without delay."""
+        """Return the delay-free policy that the agent also learns, if any; it is evaluated without delay."""
 
     def deterministic(self, state: State) -> Deterministic:
-        """The networks that `act` without `explore` consists of. Raises DelayRLError where there are none."""
+        """Return the deterministic policy as networks. Raises DelayRLError if there is none."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long a run is, and what happens when."""
+    """The length of a run and the timing of what happens in it."""
 
     steps: Annotated[int, "environment steps to train"] = 1_000_000
-    random_steps: Annotated[int, "uniformly random actions, and no updates, for so many steps first"] = 5_000
-    replay_capacity: Annotated[int, "rows of the replay: one a step, and one more an episode"] = 1_000_000
-    evaluate_every: Annotated[int, "steps between two evaluations (and checkpoints)"] = 10_000
-    evaluation_episodes: Annotated[int, "episodes of each evaluation"] = 10
-    updates_per_call: Annotated[int, "environment steps between two calls to learn, each with all that is due"] = 1
-    precision: Annotated[Precision, "of the products of matrices, where the device has a choice"] = "float32"
+    random_steps: Annotated[int, "initial steps with uniformly random actions and no updates"] = 5_000
+    replay_capacity: Annotated[int, "rows of the replay: one per step, and one more per episode"] = 1_000_000
+    evaluate_every: Annotated[int, "steps between evaluations (and checkpoints)"] = 10_000
+    evaluation_episodes: Annotated[int, "episodes per evaluation"] = 10
+    updates_per_call: Annotated[int, "environment steps between calls to learn, which run all updates due"] = 1
+    precision: Annotated[Precision, "precision of matrix products, where the device offers a choice"] = "float32"
 
 
 def template(agent: Agent, spec: Spec) -> State:
-    """Shapes and types of the agent's state, without computing it. Raises what `init` raises."""
-    key = jax.eval_shape(lambda: jax.random.key(0))  # a shape too: no device is touched
+    """Return the shapes and types of the agent's state without computing it. Raises what `init` raises."""
+    key = jax.eval_shape(lambda: jax.random.key(0))  # also only a shape: no device is touched
     return jax.eval_shape(functools.partial(agent.init, spec), key)
 
 
@@ -108,10 +108,10 @@ def descend(
     opt_state: optax.OptState,
     *args: Any,
 ) -> tuple[Params, optax.OptState, Any, Any]:
-    """One step of gradient descent on `loss(params, *args) -> (value, extra)`.
+    """Take one step of gradient descent on `loss(params, *args) -> (value, extra)`.
 
     Returns:
-        The new parameters, the optimiser's new state, the loss and the extra.
+        The new parameters, the new optimiser state, the loss and the extra.
     """
     (value, extra), gradient = jax.value_and_grad(loss, has_aux=True)(params, *args)
     change, opt_state = optimiser.update(gradient, opt_state, params)

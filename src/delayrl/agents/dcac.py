@@ -1,15 +1,15 @@
 """Delay-correcting actor-critic, DC/AC (Bouteiller, Ramstedt et al., ICLR 2021).
 
-Idea: what arrives during the next Δ steps was caused by actions already taken, so a stretch of the past stays true when
-the actions of that stretch are sampled again from today's policy, inside the augmented states. Values V(x) are learned
-on these on-policy stretches with targets of up to Δ steps, and the actor's gradient flows through the new actions in x.
+Idea: what arrives during the next Δ steps was caused by actions already taken. A stretch of past experience therefore
+stays valid when its actions are sampled again from the current policy, inside the augmented states. Values V(x) are
+learned on these on-policy stretches with targets of up to Δ steps; the actor's gradient flows through the new actions.
 
 Views: actor and critics see x_t. Unprivileged.
 
-Which stretch: x_{t+i} shows the state of step c_i = t + i - d_{t+i}. While d_{t+i} ≥ i that is a step ≤ t, made without
-the actions of t and later; and so are the rewards that arrive with it, r_j for c_{i-1} ≤ j < c_i. The sum therefore
-stops after n = max{i : d_{t+1} ≥ 1, …, d_{t+i} ≥ i} steps. With a constant delay n = Δ; at an episode's start too,
-where d grows by one a step and nothing arrives.
+Length of a stretch: x_{t+i} shows the state of step c_i = t + i - d_{t+i}. While d_{t+i} ≥ i, that step is ≤ t, so it
+does not depend on the actions of t and later; nor do the rewards that arrive with it, r_j for c_{i-1} ≤ j < c_i. The
+sum therefore stops after n = max{i : d_{t+1} ≥ 1, …, d_{t+i} ≥ i} steps. With a constant delay n = Δ, also at an
+episode's start, where d grows by one per step and nothing arrives.
 
 Deviations from the paper and from the released code are numbered in docs/algorithms/dcac.md.
 """
@@ -32,7 +32,7 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Actor and critics, the critics' targets, and the state of their one optimiser."""
+    """Actor, critics and target critics, and the state of the optimiser that actor and critics share."""
 
     actor: Params
     critic: Params
@@ -41,11 +41,11 @@ class State(NamedTuple):
 
 
 class Roll(NamedTuple):
-    """A window's stretch with re-sampled actions: from `x`, whose value is learned, to `x_last`, `steps` later."""
+    """A stretch with re-sampled actions, from `x`, whose value is learned, to `x_last`, `steps` steps later."""
 
     x: Float[Array, "*batch input"]
     x_last: Float[Array, "*batch input"]
-    reward: Float[Array, "*batch delay"]  # what arrives at each step; the first `steps` entries count
+    reward: Float[Array, "*batch delay"]  # arriving at each step; only the first `steps` entries count
     log_prob: Float[Array, "*batch delay"]
     steps: Int[Array, "*batch"]
     ended: Bool[Array, "*batch"]  # x_last shows the terminal state: its value is 0
@@ -53,34 +53,34 @@ class Roll(NamedTuple):
 
 @dataclass(frozen=True)
 class DCAC:
-    """Hyperparameters; the defaults are the released code's."""
+    """The DC/AC agent. Its hyperparameters default to the released code's."""
 
     hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
     learning_rate: Annotated[float, "Adam's step size, for actor and critics together", (0.0, 1.0)] = 3e-4
-    actor_share: Annotated[float, "weight of the actor's loss; the critics' gets the rest of 1", (0.0, 1.0)] = 0.2
-    reward_scale: Annotated[float, "rewards are multiplied by it"] = 5.0
+    actor_share: Annotated[float, "weight w of the actor's loss; the critics' loss has 1 - w", (0.0, 1.0)] = 0.2
+    reward_scale: Annotated[float, "factor on the rewards"] = 5.0
     entropy_scale: Annotated[float, "fixed weight of the entropy"] = 1.0
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
-    target_rate: Annotated[float, "τ: how far the target critics move each update", (0.0, 1.0)] = 5e-3
+    target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
     log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-20.0, 2.0)
-    batch_size: Annotated[int, "windows in a batch"] = 128
+    batch_size: Annotated[int, "windows per batch"] = 128
 
     privileged = False
 
     def ahead(self, spec: Spec) -> int:
-        """The stretch is at most Δ long."""
+        """Return the longest possible stretch, Δ steps."""
         return max(spec.delay, 1)
 
     def phases(self) -> tuple[Phase, ...]:
-        """One update at every step."""
+        """Return one phase: an update at every step."""
         return (Phase(1, 1, self.batch_size, self.update),)
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """There is none inside."""
+        """Return None: the agent learns no delay-free policy."""
         return None
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Fresh networks; targets are copies."""
+        """Initialise the networks. The target critics start as copies."""
         if spec.delay < 1:
             raise DelayRLError("dcac re-samples the actions that a delay of at least 1 step hides: give --delay N")
         actor_key, critic_key = jax.random.split(key)
@@ -91,20 +91,20 @@ class DCAC:
         return State(actor, critic, jax.tree.map(jnp.copy, critic), opt_state)
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
-        """The actor's Gaussian at inputs `x`."""
+        """Return the actor's Gaussian at inputs `x`."""
         return networks.gaussian(actor, x, self.log_std_range, "clip")
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """A sample of the policy, or its mode."""
+        """Sample the policy, or return its mode."""
         policy = self.policy(state.actor, network_input(seen, "augmented"))
         return networks.sample(policy, key)[0] if explore else networks.mode(policy)
 
     def deterministic(self, state: State) -> Deterministic:
-        """The actor."""
+        """Return the actor."""
         return Deterministic("augmented", state.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """One step of actor and critics together; then of the targets."""
+        """Update actor and critics in one gradient step, then the target critics."""
         adam, params = optax.adam(self.learning_rate), (state.actor, state.critic)
         batch = state.target, windows, key
         (actor, critic), opt_state, _, metrics = descend(adam, self.loss, params, state.opt_state, *batch)
@@ -112,13 +112,13 @@ class DCAC:
         return State(actor, critic, target, opt_state), metrics
 
     def loss(self, params: tuple[Params, Params], target: Params, windows: Window, key: Key) -> tuple[Array, Metrics]:
-        """The critics' squared error and the actor's negative soft value, both over the same stretches."""
+        """Return the weighted sum of the critics' squared error and the actor's negative soft value, and metrics."""
         actor, critic = params
         rolls = jax.vmap(self.roll, (None, 0, 0))(actor, windows, jax.random.split(key, windows.lead.shape[0]))
         y = self.soft_return(rolls, self.reward_scale, values(target, rolls.x_last))
         value = values(critic, jax.lax.stop_gradient(rolls.x))
         critic_loss = ((value - jax.lax.stop_gradient(y)) ** 2).mean(-1).sum()
-        # the rewards of a stretch do not depend on its new actions: they are left out
+        # without the rewards of a stretch, which do not depend on its new actions
         frozen = jax.lax.stop_gradient(critic)
         actor_loss = -self.soft_return(rolls, 0.0, values(frozen, rolls.x_last)).mean()
         metrics = {
@@ -131,18 +131,17 @@ class DCAC:
         return self.actor_share * actor_loss + (1 - self.actor_share) * critic_loss, metrics
 
     def soft_return(self, rolls: Roll, reward_scale: float, value: Float[Array, "2 batch"]) -> Float[Array, " batch"]:
-        """Σ_{i<n} γ^i (reward - α log π) + γ^n (1 - ended) min_j V_j(x_n), with each sample's own n."""
+        """Return Σ_{i<n} γ^i (reward - α log π) + γ^n (1 - ended) min_j V_j(x_n), with each sample's own n."""
         reward = reward_scale * rolls.reward - self.entropy_scale * rolls.log_prob
         return soft_target(
             k_step_return(reward, self.discount, rolls.steps), self.discount**rolls.steps, rolls.ended, value.min(0)
         )
 
     def roll(self, actor: Params, window: Window, key: Key) -> Roll:
-        """Act again along one window, as on-policy experience (the paper's partial trajectory re-sampling).
+        """Re-sample the actions of one window from the current policy (the paper's partial trajectory re-sampling).
 
-        It starts at t. Where the window shows the episode terminate at T, every second time it starts at T instead, and
-        a value is learned Δ after t: the delay holds the terminal state back until T + Δ, and what x is worth meanwhile
-        must be known, because re-sampled stretches lead there.
+        It starts at t. If the window terminates at T, half of the time it starts there, to learn the value at t + Δ:
+        the terminal state arrives only at T + Δ, and re-sampled stretches lead to the x before it, which need values.
         """
         delay, slots = window.delay, jnp.arange(window.delay)
         coin_key, policy_key = jax.random.split(key)
@@ -157,11 +156,11 @@ class DCAC:
             return actions.at[delay + i].set(action), log_prob
 
         actions, log_prob = jax.lax.scan(step, window.action, (slots, jax.random.split(policy_key, delay)))
-        # ages are known up to the window's last row; and after a termination, where nothing else is left to arrive
+        # ages are known up to the window's last row, and after a termination, when nothing more arrives
         true_still = (window.age[delay + 1 :] > slots) & ((slots < window.lead) | over)
         steps = jnp.cumprod(true_still.astype(jnp.int32)).sum()
         newest = delay + jnp.arange(delay + 1) - window.age[delay:]
-        received = jnp.concatenate([jnp.zeros(1), jnp.cumsum(window.reward)])  # [c]: all before r_c
+        received = jnp.concatenate([jnp.zeros(1), jnp.cumsum(window.reward)])  # [c]: sum of the rewards before r_c
         first = jnp.where(from_end, delay - window.lead, 0)
         x, x_last = (network_input(view(replace(window, action=actions), i), "augmented") for i in (first, steps))
         return Roll(
@@ -175,7 +174,7 @@ class DCAC:
 
 
 def shift(window: Window, by: Int[Array, ""]) -> Window:
-    """The window around t + `by`. After its last row nothing arrives: the age grows, at most to Δ."""
+    """Return the window around t + `by`. Nothing arrives after its last row, so the age grows, at most to Δ."""
     rows = by + jnp.arange(window.age.shape[0])
     last = window.delay + window.lead
     held = jnp.minimum(rows, window.age.shape[0] - 1)
@@ -184,5 +183,5 @@ def shift(window: Window, by: Int[Array, ""]) -> Window:
 
 
 def values(critic: Params, x: Float[Array, "*batch input"]) -> Float[Array, "2 *batch"]:
-    """Both critics' V(x)."""
+    """Return both critics' V(x)."""
     return jnp.stack([networks.mlp(params, x)[..., 0] for params in critic])

@@ -1,13 +1,13 @@
 """Delayed imitation with dataset aggregation, DIDA (Liotet, Maran, Bisi, Restelli, ICML 2022).
 
-Idea: an expert learns where there is no delay, and is then frozen. A student that sees the augmented state imitates it
-(DAgger, Ross et al. 2011): first the expert acts, then the student, round after round; and in every state that was
-visited, whoever went there, the label is what the expert would have done in the true state.
+Idea: an expert learns without delay and is then frozen. A student that sees the augmented state imitates it (DAgger,
+Ross et al. 2011). The expert acts first, then the student, in rounds. Every visited state is labelled with the expert's
+action in the true state, whoever acted.
 
 Views: the expert sees s_t, the student x_t. Privileged: the expert acts on the true state in the first part of the run.
-(Labels need no privilege: by the time that a step is learned from, its state has arrived.)
+(Labels need no privilege: a step is learned from only after its state has arrived.)
 
-There is one budget of environment steps, and the expert's are counted: it learns and acts up to step `expert_steps`.
+The expert's steps count towards the run's environment steps: it learns and acts up to step `expert_steps`.
 Deviations from the paper and from the released code are numbered in docs/algorithms/dida.md.
 """
 
@@ -29,46 +29,46 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """The expert, the student with its optimiser's state, and how far the run is."""
+    """The expert, the student with its optimiser state, and the progress of the run."""
 
     reference: sac.State
     student: Params
     opt_state: optax.OptState
-    steps: Int[Array, ""]  # environment steps that have been learned from: who acts depends on it
+    steps: Int[Array, ""]  # environment steps learned from so far, which decide who acts
 
 
 @dataclass(frozen=True)
 class DIDA:
-    """Hyperparameters; the student's defaults are the released code's, the expert's are VDPO's reference's."""
+    """The DIDA agent. The student's defaults are the released code's, the expert's are those of VDPO's reference."""
 
     reference: sac.SAC = field(default_factory=sac.SAC)
-    expert_steps: Annotated[int, "environment steps in which the expert learns and acts; whole rounds"] = 500_000
-    round_steps: Annotated[int, "environment steps in a round of aggregation, the student acting"] = 1000
-    imitation_updates: Annotated[int, "updates after each round, on fresh batches of all the data"] = 1000
+    expert_steps: Annotated[int, "steps in which the expert learns and acts; a multiple of round_steps"] = 500_000
+    round_steps: Annotated[int, "environment steps in a round of aggregation, in which the student acts"] = 1000
+    imitation_updates: Annotated[int, "student updates after each round, on fresh batches of all data"] = 1000
     student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)
     student_learning_rate: Annotated[float, "RMSprop's step size", (0.0, 1.0)] = 1e-3
     student_decay: Annotated[float, "decay of RMSprop's mean of squared gradients", (0.0, 1.0)] = 0.9
-    student_batch_size: Annotated[int, "windows in a batch of imitation"] = 32
+    student_batch_size: Annotated[int, "windows per imitation batch"] = 32
 
     privileged = True
 
     def ahead(self, spec: Spec) -> int:
-        """The expert's targets; imitation needs none."""
+        """Return the longest k of the expert's targets; imitation needs no later steps."""
         return self.reference.ahead(spec)
 
     def phases(self) -> tuple[Phase, ...]:
-        """The expert at every step; imitation at the end of every round."""
+        """Return two phases: the expert learns at every step, the student at the end of every round."""
         return (
             Phase(1, 1, self.reference.batch_size, self.update),
             Phase(self.round_steps, self.imitation_updates, self.student_batch_size, self.imitate),
         )
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """The expert."""
+        """Return the expert."""
         return self.reference, state.reference
 
     def check(self, schedule: Schedule) -> None:
-        """The expert learns after the random steps, the student before the run ends."""
+        """Raise DelayRLError unless the expert finishes after the random steps and before the end of the run."""
         if not schedule.random_steps < self.expert_steps < schedule.steps:
             raise DelayRLError(
                 f"expert_steps must lie between random_steps and steps, {schedule.random_steps} and {schedule.steps}; "
@@ -76,14 +76,14 @@ class DIDA:
             )
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Fresh networks."""
+        """Initialise expert and student."""
         if spec.delay < 1:
             raise DelayRLError("dida learns a policy for a delay of at least 1 step: give --delay N, or train sac")
         if (self.reference.update_every, self.reference.updates) != (1, 1):
             raise DelayRLError("dida's expert is updated once a step: leave update_every and updates at 1")
         if self.expert_steps % self.round_steps:
             raise DelayRLError(
-                f"expert_steps must be whole rounds of {self.round_steps} steps; got {self.expert_steps}"
+                f"expert_steps must be a multiple of round_steps = {self.round_steps}; got {self.expert_steps}"
             )
         reference_key, student_key = jax.random.split(key)
         sizes = (input_size(spec, "augmented"), *self.student_hidden, spec.action_size)
@@ -93,15 +93,15 @@ class DIDA:
 
     @property
     def optimiser(self) -> optax.GradientTransformation:
-        """RMSprop as in PyTorch: ε outside of the root."""
+        """RMSprop as in PyTorch, with ε outside the root."""
         return optax.rmsprop(self.student_learning_rate, self.student_decay, eps=1e-10, eps_in_sqrt=False)
 
     def policy(self, student: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch action"]:
-        """The student's action at inputs `x`: it is deterministic."""
+        """Return the student's deterministic action at inputs `x`."""
         return jnp.tanh(networks.mlp(student, x))
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """The student; but in the first part of training the expert, exploring as SAC does."""
+        """Return the student's action, or in the first part of training the expert's, which explores as SAC does."""
         student = self.policy(state.student, network_input(seen, "augmented"))
         if not explore:
             return student
@@ -110,11 +110,11 @@ class DIDA:
         return jnp.where(state.steps < self.expert_steps, expert, student)
 
     def deterministic(self, state: State) -> Deterministic:
-        """The student."""
+        """Return the student."""
         return Deterministic("augmented", state.student)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """SAC's update of the expert, up to `expert_steps`; `count` is the environment step, the same for all seeds."""
+        """Update the expert by SAC, up to `expert_steps`; `count` is the environment step, the same for all seeds."""
 
         def learn(reference: sac.State) -> tuple[sac.State, Metrics]:
             return self.reference.update(reference, windows, key, count)
@@ -127,7 +127,7 @@ class DIDA:
         return state._replace(reference=reference, steps=jnp.asarray(count, jnp.int32)), metrics
 
     def imitate(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """One update of the student, once the expert has finished: for the first time before the student acts."""
+        """Update the student once, if the expert has finished. The first updates precede the student's first action."""
 
         def learn(student: Params, opt_state: optax.OptState) -> tuple[Params, optax.OptState, Array]:
             student, opt_state, loss, _ = descend(
@@ -145,7 +145,7 @@ class DIDA:
         return state._replace(student=student, opt_state=opt_state), {"imitation_loss": loss}
 
     def imitation_loss(self, student: Params, expert: Params, windows: Window) -> tuple[Array, None]:
-        """Σ |a_student(x_t) - a_expert(s_t)| over batch and dimensions; the expert's action is its mode."""
+        """Return Σ |a_student(x_t) - a_expert(s_t)| over batch and dimensions; the expert's action is its mode."""
         x, s = (jax.vmap(lambda window, sees=sees: look(window, sees))(windows) for sees in ("augmented", "current"))
         label = jax.lax.stop_gradient(networks.mode(self.reference.policy(expert, s)))
         return jnp.abs(self.policy(student, x) - label).sum(), None

@@ -1,4 +1,4 @@
-"""The random policy: uniform actions. The lower anchor of normalised returns (VDPO §5: Ret_rand)."""
+"""The random policy: uniform actions. Its return is the lower anchor of normalised returns (VDPO §5: Ret_rand)."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,37 +13,37 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Nothing but the size of an action."""
+    """The state of an agent that learns nothing: only the action size."""
 
     action_size: Int[Array, " action"]
 
 
 @dataclass(frozen=True)
 class Random:
-    """Learns nothing and has no hyperparameters."""
+    """The random agent. It learns nothing and has no hyperparameters."""
 
     privileged = False
 
     def ahead(self, spec: Spec) -> int:
-        """It samples nothing."""
+        """Return 1; no windows are sampled."""
         return 1
 
     def phases(self) -> tuple[Phase, ...]:
-        """None."""
+        """Return no phases: nothing is learned."""
         return ()
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """There is none inside."""
+        """Return None: the agent learns no delay-free policy."""
         return None
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Remember the action's size."""
+        """Return a state with the action size."""
         return State(jnp.zeros(spec.action_size, jnp.int32))
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """Uniform in [-1, 1], in evaluation too."""
+        """Sample uniformly from [-1, 1], in evaluation too."""
         return jax.random.uniform(key, state.action_size.shape, minval=-1, maxval=1)
 
     def deterministic(self, state: State) -> Deterministic:
-        """There is nothing to export."""
+        """Raise DelayRLError: there is no deterministic policy."""
         raise DelayRLError("random draws its actions: it has no deterministic policy to export")

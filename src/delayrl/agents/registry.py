@@ -1,4 +1,4 @@
-"""The registry: every agent with its presets. To add one: its file, its line here, its page in docs/algorithms."""
+"""The registry of agents and their presets. A new agent needs a file, an entry here and a page in docs/algorithms."""
 
 import difflib
 from dataclasses import replace
@@ -17,14 +17,14 @@ from delayrl.errors import DelayRLError
 
 
 class Preset(NamedTuple):
-    """Hyperparameters and schedule that belong together."""
+    """An agent's hyperparameters with the schedule that belongs to them."""
 
     agent: Agent
     schedule: Schedule
 
 
 class Registration(NamedTuple):
-    """One line of the registry."""
+    """An entry of the registry."""
 
     summary: str
     paper: str
@@ -32,7 +32,7 @@ class Registration(NamedTuple):
     official: Protocol = OFFICIAL
 
     def protocol(self, name: str) -> Protocol:
-        """Return a protocol by its name. Raises DelayRLError for an unknown one."""
+        """Return the protocol called `name`. Raises DelayRLError if there is none."""
         protocols = {"corrected": CORRECTED, "official": self.official}
         if name not in protocols:
             raise DelayRLError(f"protocol must be corrected or official; got {name!r}")
@@ -40,17 +40,17 @@ class Registration(NamedTuple):
 
 
 _CLEARED = replace(OFFICIAL, last_starts="dropped")
-"""Released code whose n-step window is cleared at the end of an episode."""
+"""The protocol of released code that clears its n-step window at the end of an episode."""
 _SMALL = Schedule(steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500)
 
 
 def _presets(paper: Agent, small: Agent, random_steps: int = 5_000) -> dict[str, Preset]:
-    """The paper's own hyperparameters, with its random steps; and small ones, for minutes on a laptop."""
+    """Return the paper's hyperparameters with its random steps, and small ones that train in minutes on a laptop."""
     return {"paper": Preset(paper, Schedule(random_steps=random_steps)), "small": Preset(small, _SMALL)}
 
 
 def _soft(summary: str, paper: str, **sees: str) -> Registration:
-    """SAC on two views: it differs in what is seen alone, so nothing else explains a difference."""
+    """Return the entry of SAC with the views `sees`, which are the only difference between these agents."""
     agent = SAC(**sees)  # type: ignore[arg-type]
     return Registration(summary, paper, _presets(agent, replace(agent, batch_size=128)))
 
@@ -111,7 +111,7 @@ AGENTS: dict[str, Registration] = {
 
 
 def find_agent(name: str) -> Registration:
-    """Return an agent's line in the registry. Raises DelayRLError with the nearest names for an unknown one."""
+    """Return the registry's entry for an agent. Raises DelayRLError with the nearest names if there is none."""
     if name not in AGENTS:
         near = difflib.get_close_matches(name, AGENTS, n=2, cutoff=0.4) or AGENTS
         raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")

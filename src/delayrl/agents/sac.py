@@ -1,8 +1,8 @@
-"""Soft actor-critic on two views: SAC, memoryless SAC, A-SAC and BPQL are this one update.
+"""Soft actor-critic with a view for each network: SAC, memoryless SAC, A-SAC and BPQL share one update.
 
-Papers: SAC (Haarnoja et al. 2018); A-SAC and BPQL (Kim et al. 2023) as VDPO's tables name them.
-Idea: a soft Q-learner with an entropy-regularised actor. What the actor sees decides what it can do under delay; what
-the critic sees decides how large the space is in which values are learned.
+Papers: SAC (Haarnoja et al. 2018); A-SAC and BPQL (Kim et al. 2023), named as in VDPO's tables. Idea: a soft Q-learner
+with an entropy-regularised actor. The actor's view limits what it can do under delay; the critics' view sets the size
+of the space in which values are learned.
 
 | agent | actor sees | critic sees |
 | --- | --- | --- |
@@ -33,7 +33,7 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Networks, their targets, and the states of their optimisers."""
+    """Actor, critics, target critics, log-temperature and optimiser states."""
 
     actor: Params
     critic: Params
@@ -45,17 +45,17 @@ class State(NamedTuple):
 
 
 Penalty = Callable[[Gaussian], Array]
-"""Added to the actor's loss, a function of its policy at the batch: for agents built on this one."""
+"""A term that agents built on SAC add to the actor's loss: a function of its policy on the batch."""
 
 
 def no_penalty(policy: Gaussian) -> Array:
-    """SAC's own."""
+    """Return 0: SAC itself adds nothing to the actor's loss."""
     return jnp.zeros(())
 
 
 @dataclass(frozen=True)
 class SAC:
-    """Hyperparameters of soft actor-critic; the defaults are VDPO's (appendix, table of hyperparameters)."""
+    """The SAC agent. Its hyperparameters default to VDPO's (appendix, table of hyperparameters)."""
 
     actor_sees: Annotated[Sees, "fixed"] = "current"
     critic_sees: Annotated[Sees, "fixed"] = "current"
@@ -63,35 +63,35 @@ class SAC:
     actor_learning_rate: Annotated[float, "Adam's step size for the actor", (0.0, 1.0)] = 3e-4
     critic_learning_rate: Annotated[float, "Adam's step size for the critics", (0.0, 1.0)] = 1e-3
     temperature_learning_rate: Annotated[float, "Adam's step size for the temperature", (0.0, 1.0)] = 1e-3
-    initial_temperature: Annotated[float, "weight of the entropy at the start", (1e-6, 1e6)] = 1.0
-    entropy_per_action: Annotated[float, "target entropy, for each dimension of the action"] = -1.0
+    initial_temperature: Annotated[float, "initial weight of the entropy", (1e-6, 1e6)] = 1.0
+    entropy_per_action: Annotated[float, "target entropy per action dimension"] = -1.0
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
-    target_rate: Annotated[float, "τ: how far the target critics move each update", (0.0, 1.0)] = 5e-3
+    target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
     n_steps: Annotated[int, "longest k of the k-step targets; k is drawn from 1..n_steps"] = 3
-    actor_every: Annotated[int, "critic updates between two rounds of actor updates"] = 2
-    actor_updates: Annotated[int, "actor updates in a round"] = 2
+    actor_every: Annotated[int, "critic updates between rounds of actor updates"] = 2
+    actor_updates: Annotated[int, "actor updates per round"] = 2
     log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-5.0, 2.0)
-    log_std_bounds: Annotated[LogStdBounds, "how it is kept there"] = "rescale"
-    batch_size: Annotated[int, "windows in a batch"] = 256
-    update_every: Annotated[int, "environment steps between two rounds of updates"] = 1
-    updates: Annotated[int, "updates in a round"] = 1
+    log_std_bounds: Annotated[LogStdBounds, "how the log standard deviation is kept within its bounds"] = "rescale"
+    batch_size: Annotated[int, "windows per batch"] = 256
+    update_every: Annotated[int, "environment steps between rounds of updates"] = 1
+    updates: Annotated[int, "updates per round"] = 1
 
     privileged = False
 
     def ahead(self, spec: Spec) -> int:
-        """k-step targets reach so far."""
+        """Return the longest k of the k-step targets."""
         return self.n_steps
 
     def phases(self) -> tuple[Phase, ...]:
-        """One: the update."""
+        """Return one phase, the update."""
         return (Phase(self.update_every, self.updates, self.batch_size, self.update),)
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """There is none inside."""
+        """Return None: the agent learns no delay-free policy."""
         return None
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Fresh networks; targets are copies."""
+        """Initialise the networks. The target critics start as copies."""
         if self.actor_sees == "current" and spec.delay > 0:
             raise DelayRLError(
                 f"sac is the delay-free reference: train it with --delay 0, got {spec.delay}; "
@@ -114,22 +114,22 @@ class SAC:
         )
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
-        """The actor's Gaussian at inputs `x`."""
+        """Return the actor's Gaussian at inputs `x`."""
         return networks.gaussian(actor, x, self.log_std_range, self.log_std_bounds)
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """A sample of the policy, or its mode."""
+        """Sample the policy, or return its mode."""
         policy = self.policy(state.actor, network_input(seen, self.actor_sees))
         return networks.sample(policy, key)[0] if explore else networks.mode(policy)
 
     def deterministic(self, state: State) -> Deterministic:
-        """The actor."""
+        """Return the actor."""
         return Deterministic(self.actor_sees, state.actor)
 
     def update(
         self, state: State, windows: Window, key: Key, count: Int[Array, ""], penalty: Penalty = no_penalty
     ) -> tuple[State, Metrics]:
-        """One critic update; every `actor_every`-th time the actor and the temperature, on the same batch."""
+        """Update the critics and, every `actor_every`-th time, the actor and the temperature on the same batch."""
         target_key, actor_key = jax.random.split(key)
         actor_now, critic_now = self._inputs(windows, 0)
         actor_next, critic_next = self._inputs(windows, windows.n_step)
@@ -153,7 +153,7 @@ class SAC:
     def learn_critic(
         self, state: State, windows: Window, critic_input: Array, next_value: Float[Array, " batch"]
     ) -> tuple[State, Metrics]:
-        """One step of both critics towards the soft k-step target, given V(s_{t+k}); and of their targets."""
+        """Update both critics towards the soft k-step target, given V(s_{t+k}), then the target critics."""
         now, last = windows.delay, windows.delay + windows.n_step - 1
         y = soft_target(
             k_step_return(windows.reward[:, now:], self.discount, windows.n_step),
@@ -170,7 +170,7 @@ class SAC:
     def improve_actor(
         self, state: State, actor_input: Array, critic_input: Array, key: Key, penalty: Penalty = no_penalty
     ) -> State:
-        """One step of the actor towards higher soft values (VDPO eq. 9)."""
+        """Take one gradient step on the actor towards higher soft values (VDPO eq. 9)."""
         temperature = jnp.exp(state.log_temperature)
 
         def loss(actor: Params) -> tuple[Array, None]:
@@ -184,7 +184,7 @@ class SAC:
         return state._replace(actor=actor, actor_opt_state=opt_state)
 
     def adjust_temperature(self, state: State, actor_input: Array, action_size: int, key: Key) -> State:
-        """One step of the temperature towards the target entropy, on a sample of its own."""
+        """Take one gradient step on the temperature towards the target entropy, with a fresh sample of the policy."""
         target_entropy = self.entropy_per_action * action_size
         _, log_prob = networks.sample(self.policy(state.actor, actor_input), key)
 
@@ -196,14 +196,14 @@ class SAC:
         return state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
 
     def _inputs(self, windows: Window, ahead: int | Array) -> tuple[Array, Array]:
-        """What actor and critic see `ahead` steps after t, for each window."""
+        """Return the inputs of actor and critics at `ahead` steps after t, for each window."""
         ahead = jnp.broadcast_to(ahead, windows.n_step.shape)
         pair = jax.vmap(lambda window, k: (look(window, self.actor_sees, k), look(window, self.critic_sees, k)))
         return pair(windows, ahead)
 
 
 def critic_loss(critic: Params, x: Array, action: Array, target: Array) -> tuple[Array, Array]:
-    """Squared error of both critics, added (VDPO eq. 8); and their mean value."""
+    """Return the sum of both critics' squared errors (VDPO eq. 8), and their mean Q-value."""
     q = networks.twin(critic, x, action)
     return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum(), q.mean()
 
@@ -221,4 +221,4 @@ BPQL = SAC(
     update_every=50,
     updates=50,
 )
-"""The hyperparameters of BPQL's released code."""
+"""BPQL with the hyperparameters of its released code."""

@@ -1,12 +1,10 @@
 """Variational Delayed Policy Optimization (Wu et al., NeurIPS 2024), Algorithm 1.
 
-Idea: (A) learn a reference policy with SAC where there is no delay; (B) clone it into a delayed policy: a transformer
-on (last observation, actions since) whose belief head reconstructs the unseen states, and whose policy head is brought
-near the reference by KL. Position i of the transformer serves the delay i + 1, so one network serves every age 1..Δ;
-at age 0 the state is current and the reference itself acts.
+Idea: (A) learn a reference policy by SAC without delay; (B) clone it into a delayed policy, a transformer on (last
+observation, actions since) whose belief head reconstructs the unseen states and whose policy head is trained towards
+the reference by KL. Position i serves the delay i + 1, so one network serves all ages 1..Δ; at 0 the reference acts.
 
-Views: the reference sees s_t, the delayed policy x_t. While it trains, its behaviour reads s_t (privileged), unless
-`behaviour="delayed"`.
+Views: the reference sees s_t, the delayed policy x_t. Privileged in training (reads s_t) unless `behaviour="delayed"`.
 
 Deviations from the paper and from the released code are numbered in docs/algorithms/vdpo.md.
 """
@@ -35,7 +33,7 @@ Direction = Literal["reverse", "forward"]
 
 
 class State(NamedTuple):
-    """The reference, and the delayed policy's parts: encoder, belief decoder, policy head."""
+    """The reference, and the parts of the delayed policy: encoder, belief decoder and policy head."""
 
     reference: sac.State
     encoder: Params
@@ -46,7 +44,7 @@ class State(NamedTuple):
 
 
 class Unseen(NamedTuple):
-    """What is cloned from: x_{t+1}, and the states that it hides."""
+    """A batch for belief and cloning: x_{t+1} and the states that it hides."""
 
     obs: Float[Array, "batch obs"]
     actions: Float[Array, "batch delay action"]
@@ -56,40 +54,43 @@ class Unseen(NamedTuple):
 
 @dataclass(frozen=True)
 class VDPO:
-    """Hyperparameters; the defaults are the paper's (appendix) and, where it is silent, the released code's."""
+    """The VDPO agent. Its hyperparameters default to the paper's (appendix), or else to the released code's."""
 
     reference: sac.SAC = field(default_factory=sac.SAC)
-    representation: Annotated[Representation, "of x_t; the paper's ablation"] = "transformer"
-    width: Annotated[int, "embedding dimension of the transformer, and width of the policy head"] = 256
-    layers: Annotated[int, "blocks of the transformer"] = 3
-    dropout: Annotated[float, "rate in embedding, attention and residuals", (0.0, 0.99)] = 0.1
+    representation: Annotated[Representation, "encoder of x_t; the others are the paper's ablation"] = "transformer"
+    width: Annotated[int, "embedding dimension of the transformer and width of the policy head"] = 256
+    layers: Annotated[int, "transformer blocks"] = 3
+    dropout: Annotated[float, "dropout rate of embedding, attention and residuals", (0.0, 0.99)] = 0.1
     learning_rate: Annotated[float, "Adam's step size for the delayed policy", (0.0, 1.0)] = 3e-4
-    clone_every: Annotated[int, "environment steps between two rounds of cloning"] = 1000
-    clone_updates: Annotated[int, "KL updates in a round, each on a fresh batch"] = 1000
-    direction: Annotated[Direction, "KL(delayed‖reference), or forward: KL(reference‖delayed)"] = "reverse"
-    behaviour: Annotated[Behaviour, "who acts in training: the sample with the lower Q, or what is named"] = "lower-q"
+    clone_every: Annotated[int, "environment steps between rounds of cloning"] = 1000
+    clone_updates: Annotated[int, "KL updates per round, each on a fresh batch"] = 1000
+    direction: Annotated[Direction, "reverse: KL(delayed‖reference); forward: KL(reference‖delayed)"] = "reverse"
+    behaviour: Annotated[
+        Behaviour,
+        "who acts in training: delayed, reference, mixture (a coin flip), or lower-q (the one with the lower Q)",
+    ] = "lower-q"
 
     @property
     def privileged(self) -> bool:
-        """The reference needs the true state to act."""
+        """Whether the reference may act in training. It needs the true state."""
         return self.behaviour != "delayed"
 
     def ahead(self, spec: Spec) -> int:
-        """The reference's targets; cloning needs one step."""
+        """Return the longest k of the reference's targets; cloning needs one step."""
         return self.reference.ahead(spec)
 
     def phases(self) -> tuple[Phase, ...]:
-        """Reference and belief at every step; now and then many KL updates."""
+        """Return two phases: reference and belief learn at every step, cloning runs in rounds of many KL updates."""
         learn, *_ = self.reference.phases()
         clone = Phase(self.clone_every, self.clone_updates, self.reference.batch_size, self.clone)
         return learn._replace(update=self.update), clone
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """The delay-free SAC that is cloned."""
+        """Return the delay-free SAC that is cloned."""
         return self.reference, state.reference
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Fresh networks; Δ is the transformer's length."""
+        """Initialise the networks. The transformer's length is Δ."""
         if spec.delay < 1:
             raise DelayRLError("vdpo learns a policy for a delay of at least 1 step: give --delay N, or train sac")
         reference_key, encoder_key, decoder_key, head_key = jax.random.split(key, 4)
@@ -111,7 +112,7 @@ class VDPO:
         )
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
-        """The delayed policy at the shown age; in training, who acts is what `behaviour` says."""
+        """Return the delayed policy's action at the shown age; in training, `behaviour` decides which policy acts."""
         dropout_key, delayed_key, reference_key, coin_key = jax.random.split(key, 4)
         every_age = self.policy(state, seen.obs, seen.actions, dropout_key if explore else None)
         current = self.reference.policy(state.reference.actor, seen.obs)
@@ -135,11 +136,11 @@ class VDPO:
         return networks.lower_q(state.reference.critic, truth, reference, delayed)
 
     def deterministic(self, state: State) -> Deterministic:
-        """Encoder and policy head; at age 0 the reference."""
+        """Return encoder and policy head, and the reference for age 0."""
         return Deterministic("augmented", state.head, state.encoder or None, state.reference.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """(A) SAC's update of the reference; and of encoder and belief decoder (eq. 10), on the same batch."""
+        """Update the reference by SAC (A), and encoder and belief decoder (eq. 10), on the same batch."""
         sac_key, dropout_key = jax.random.split(key)
         reference, metrics = self.reference.update(state.reference, windows, sac_key, count)
         state = state._replace(reference=reference)
@@ -152,20 +153,20 @@ class VDPO:
         return state, metrics | {"belief_loss": loss}
 
     def clone(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """(B) One KL update of the policy head towards the reference (eq. 11); the encoder stays where it is."""
+        """Take one KL step of the delayed policy towards the reference (B, eq. 11), on the networks in `_cloned`."""
         adam, params = optax.adam(self.learning_rate), self._cloned(state.encoder, state.head)
         batch = state, unseen(windows), key
         cloned, opt_state, loss, _ = descend(adam, self.clone_loss, params, state.clone_opt_state, *batch)
         return state._replace(**cloned, clone_opt_state=opt_state), {"kl": loss}
 
     def policy(self, state: State, obs: Array, actions: Array, key: Key | None = None) -> Gaussian:
-        """The delayed policy for every age 1..Δ: [..., Δ, A]."""
+        """Return the delayed policy for every age 1..Δ: [..., Δ, A]."""
         return self.reference.policy(state.head, self.encode(state.encoder, obs, actions, key))
 
     def encode(
         self, encoder: Params, obs: Array, actions: Array, key: Key | None
     ) -> Float[Array, "*batch delay width"]:
-        """What the heads read at each age. `mlp`: the augmented state of that age itself."""
+        """Return the input of the heads at each age; for `mlp`, the augmented state of that age."""
         if self.representation != "mlp":
             return transformer(encoder, obs, actions, self.dropout, key)
         *batch, delay, size = actions.shape
@@ -175,25 +176,25 @@ class VDPO:
         return jnp.concatenate([repeated, until.reshape(*batch, delay, delay * size), ages], -1)
 
     def belief_loss(self, params: tuple[Params, Params], x: Unseen, key: Key) -> tuple[Array, None]:
-        """Mean squared error of the reconstructed states (eq. 10)."""
+        """Return the mean squared error of the reconstructed states (eq. 10)."""
         encoder, decoder = params
         states = networks.linear(decoder, self.encode(encoder, x.obs, x.actions, key))
         return masked_mean(((states - x.states) ** 2).mean(-1), x.mask), None
 
     def clone_loss(self, cloned: Params, state: State, x: Unseen, key: Key) -> tuple[Array, None]:
-        """KL between the delayed policy at each age and the reference at the state that it cannot see (eq. 11)."""
+        """Return the KL between the delayed policy at each age and the reference at the hidden state (eq. 11)."""
         delayed = self.policy(state._replace(**cloned), x.obs, x.actions, key)
         reference = self.reference.policy(state.reference.actor, x.states)
         pair = (delayed, reference) if self.direction == "reverse" else (reference, delayed)
         return masked_mean(gaussian_kl(*pair).mean(-1), x.mask), None
 
     def _cloned(self, encoder: Params, head: Params) -> Params:
-        """What cloning trains: the head; without a belief loss the encoder too."""
+        """Return the networks that cloning trains: the head, and without a belief loss the transformer too."""
         return {"head": head, "encoder": encoder} if self.representation == "transformer-no-belief" else {"head": head}
 
 
 def unseen(windows: Window) -> Unseen:
-    """x_{t+1} with all the Δ steps that it hides (fewer at the start of an episode), for each window."""
+    """Return x_{t+1} and the Δ states that it hides (fewer at the start of an episode), for each window."""
 
     def of_window(window: Window) -> Unseen:
         now = window.delay + 1

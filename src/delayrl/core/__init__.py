@@ -1,1 +1,1 @@
-"""What flows through training, and pure functions on it: types, replay, views, networks, objectives."""
+"""Data types and pure functions on arrays: the replay, views, networks, objectives and protocols."""

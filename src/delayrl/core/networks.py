@@ -1,4 +1,4 @@
-"""Networks as pure functions on plain trees of arrays: `*_init(key, …) -> params`, then `network(params, x)`."""
+"""Networks as pure functions on pytrees: `*_init(key, …)` returns the `params` that `network(params, x)` takes."""
 
 import itertools
 import math
@@ -12,37 +12,37 @@ from jaxtyping import Array, Float
 from delayrl.core.types import Key
 
 Params = Any
-"""A tree (dicts and lists) of arrays."""
+"""A pytree (dicts and lists) of arrays."""
 LogStdBounds = Literal["rescale", "clip"]
 
 
 class Gaussian(NamedTuple):
-    """A diagonal Gaussian before the tanh that squashes it to actions in [-1, 1]."""
+    """A diagonal Gaussian over actions, before the tanh that squashes them to [-1, 1]."""
 
     mean: Float[Array, "*batch action"]
     log_std: Float[Array, "*batch action"]
 
 
 def linear_init(key: Key, inputs: int, outputs: int, std: float | None = None) -> Params:
-    """One layer of `mlp_init`."""
+    """Initialise one layer as `mlp_init` does."""
     return mlp_init(key, (inputs, outputs), std)[0]
 
 
 def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-    """X W + b. As one product of two matrices, whose gradient is faster than that of a product with more axes.
+    """Return X W + b. All leading axes are flattened into one, which makes the gradient faster.
 
-    Of many rows as two products of half of them: in one for the weights' gradient a second core helps XLA little.
+    Large batches are split into two products: XLA barely uses a second core for the weight gradient of a single one.
     """
     w, rows = params["w"], x.reshape(-1, x.shape[-1]) if x.ndim > 2 else x
-    if x.ndim > 1 and len(rows) >= 4000 and len(rows) % 2 == 0:  # docs/performance.md
+    if x.ndim > 1 and len(rows) >= 4000 and len(rows) % 2 == 0:  # see docs/performance.md
         rows, w = rows.reshape(2, -1, rows.shape[1]), jnp.broadcast_to(w, (2, *w.shape))
     return (rows @ w).reshape(*x.shape[:-1], -1) + params["b"]
 
 
 def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None) -> Params:
-    """Layers from sizes[0] inputs to sizes[-1] outputs.
+    """Initialise linear layers from sizes[0] inputs to sizes[-1] outputs.
 
-    PyTorch's default, weights and biases uniform within 1/√inputs; or weights N(0, std²) and no bias.
+    Weights and biases are uniform within 1/√inputs (PyTorch's default); with `std`, weights are N(0, std²), biases 0.
     """
     shapes = list(itertools.pairwise(sizes))
     weights = cut(jax.random.normal if std else uniform, key, [*shapes, *[(o,) for _, o in shapes]])
@@ -52,20 +52,20 @@ def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None) -> Para
     return [{"w": w * len(w) ** -0.5, "b": b * len(w) ** -0.5} for w, b in zip(matrices, biases, strict=True)]
 
 
-def cut(draw: Callable[..., Array], key: Key, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """Random arrays of several shapes from one draw, which compiles several times faster than a draw for each."""
+def cut(sampler: Callable[..., Array], key: Key, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Sample arrays of several shapes in one call, which compiles several times faster than a call for each."""
     sizes = [math.prod(shape) for shape in shapes]
-    pieces = jnp.split(draw(key, (sum(sizes),)), list(itertools.accumulate(sizes))[:-1])
+    pieces = jnp.split(sampler(key, (sum(sizes),)), list(itertools.accumulate(sizes))[:-1])
     return [piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
 def uniform(key: Key, shape: tuple[int, ...]) -> Array:
-    """Uniform in [-1, 1]."""
+    """Sample uniformly from [-1, 1]."""
     return jax.random.uniform(key, shape, minval=-1, maxval=1)
 
 
 def mlp(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-    """ReLU between the layers, none after the last."""
+    """Apply the layers in order, with a ReLU after each but the last."""
     for layer in params[:-1]:
         x = jax.nn.relu(linear(layer, x))
     return linear(params[-1], x)
@@ -77,7 +77,7 @@ def gaussian(
     log_std_range: tuple[float, float],
     bounds: LogStdBounds = "rescale",
 ) -> Gaussian:
-    """An `mlp` whose outputs are mean and log-std; the log-std is kept in its range by a rescaled tanh, or clipped."""
+    """Return the Gaussian that an `mlp` outputs, with its log-std kept in range by a rescaled tanh or by clipping."""
     mean, log_std = jnp.split(mlp(params, x), 2, -1)
     low, high = log_std_range
     if bounds == "rescale":
@@ -86,28 +86,28 @@ def gaussian(
 
 
 def mode(policy: Gaussian) -> Float[Array, "*batch action"]:
-    """The deterministic action, tanh(mean)."""
+    """Return the deterministic action, tanh(mean)."""
     return jnp.tanh(policy.mean)
 
 
 def sample(policy: Gaussian, key: Key) -> tuple[Float[Array, "*batch action"], Float[Array, "*batch"]]:
-    """An action in [-1, 1] and the log of its density there (SAC, Haarnoja et al. 2018, appendix C)."""
+    """Sample an action in [-1, 1] and return it with its log-density (SAC, Haarnoja et al. 2018, appendix C)."""
     noise = jax.random.normal(key, policy.mean.shape)
     raw = policy.mean + jnp.exp(policy.log_std) * noise
     normal = -0.5 * noise**2 - policy.log_std - 0.5 * jnp.log(2 * jnp.pi)
-    slope = 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))  # log(1 - tanh²), without its cancellation
+    slope = 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))  # log(1 - tanh²), without cancellation
     return jnp.tanh(raw), (normal - slope).sum(-1)
 
 
 def twin_init(key: Key, sizes: tuple[int, ...]) -> Params:
-    """Two independent critics."""
+    """Initialise two independent critics."""
     return [mlp_init(k, sizes) for k in jax.random.split(key)]
 
 
 def twin(
     params: Params, x: Float[Array, "*batch inputs"], action: Float[Array, "*batch action"]
 ) -> Float[Array, "2 *batch"]:
-    """Both values of each (input, action). Two small products are faster on a CPU than one batched one."""
+    """Return both critics' Q-values. Two small products are faster on a CPU than one batched product."""
     both = jnp.concatenate([x, action], -1)
     return jnp.stack([mlp(critic, both)[..., 0] for critic in params])
 
@@ -115,6 +115,6 @@ def twin(
 def lower_q(
     critic: Params, x: Float[Array, " input"], one: Float[Array, " action"], other: Float[Array, " action"]
 ) -> Float[Array, " action"]:
-    """Of two actions the one that the lower critic thinks less of: the released behaviour of VDPO and AD-SAC."""
+    """Return the action with the lower min_i Q_i: the behaviour in the released code of VDPO and AD-SAC."""
     q_one, q_other = (twin(critic, x, action).min(0) for action in (one, other))
     return jnp.where(q_one < q_other, one, other)

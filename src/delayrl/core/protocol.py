@@ -1,4 +1,4 @@
-"""Protocols: how episodes start and end, what is learned from, and how policies are evaluated."""
+"""Protocols: how episodes start and end, which steps are learned from, and how policies are evaluated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,17 +7,17 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to train and evaluate. docs/concepts.md compares the two that exist."""
+    """One way to train and evaluate. docs/concepts.md compares the two protocols."""
 
-    name: str  # as rows and the command line have it
-    start_states: Literal["own", "same"] = "own"  # each episode's own, or the one that the run's seed gives
-    time_limit: Literal["bootstraps", "terminates"] = "bootstraps"  # what it means for the value of the state after it
-    first_action: Literal["agent", "random"] = "agent"  # whose the first action of an episode is, if there is a delay
+    name: str  # as in result rows and on the command line
+    start_states: Literal["own", "same"] = "own"  # a new one per episode, or always the one that the run's seed gives
+    time_limit: Literal["bootstraps", "terminates"] = "bootstraps"  # whether targets keep the next state's value
+    first_action: Literal["agent", "random"] = "agent"  # who chooses an episode's first action under a delay
     last_starts: Literal["kept", "dropped"] = "kept"  # steps too close to an episode's end for a full n-step target
-    overrides: Mapping[str, Any] = field(default_factory=dict)  # the agent's hyperparameters that belong to it
+    overrides: Mapping[str, Any] = field(default_factory=dict)  # hyperparameters of the agent that it sets
 
 
 CORRECTED = Protocol("corrected")
-"""Ours, and the default."""
+"""The default."""
 OFFICIAL = Protocol("official", start_states="same", time_limit="terminates", first_action="random")
-"""Habits of VDPO's released code that hold for every agent; the registry adds those of single agents."""
+"""Conventions of VDPO's released code that apply to every agent; the registry adds those of individual agents."""

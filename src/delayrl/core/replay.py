@@ -1,8 +1,8 @@
-"""Replay: one ring of the true trajectory on the device, whatever the delay.
+"""Replay buffer: one ring of the undelayed trajectory on the device, for any delay.
 
-A row is an observation and what was done in it; an episode of T steps takes T + 1 rows, the last for its final
-observation. So each observation is stored once (Humanoid, a million rows: 1.6 GB), and every augmented state, belief
-target and k-step return is gathered by index when it is sampled. Functions are for one seed; `jax.vmap` adds the axis.
+A row holds an observation and the step taken from it; an episode of T steps takes T + 1 rows, the last for its final
+observation. Each observation is stored once (Humanoid, a million rows: 1.6 GB). Augmented states, belief targets and
+k-step returns are gathered by index when they are sampled. The functions handle one seed; `jax.vmap` adds the axis.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from delayrl.core.types import Key, Spec, Transition, Window
 
 
 class Replay(NamedTuple):
-    """The ring. Row r of the trajectory, counted from the first ever, lies at index r mod capacity."""
+    """The ring. Row r of the trajectory, counted from the start of the run, lies at index r mod capacity."""
 
     obs: Float[Array, "capacity obs"]
     action: Float[Array, "capacity action"]
@@ -24,13 +24,13 @@ class Replay(NamedTuple):
     terminated: Bool[Array, " capacity"]
     moment: Int[Array, " capacity"]  # steps since the start of the row's episode
     row_of: Int[Array, " capacity"]  # step j of the run (mod capacity) -> its row
-    rows: Int[Array, ""]  # the row of the current observation: rows completed so far
+    rows: Int[Array, ""]  # rows completed so far, so the row of the current observation
     steps: Int[Array, ""]  # steps stored so far
-    lost: Int[Array, ""]  # of them, steps that the ring has overwritten
+    lost: Int[Array, ""]  # how many of them the ring has overwritten
 
 
 def init(spec: Spec, capacity: int) -> Replay:
-    """An empty ring of `capacity` rows: 4 (S + A) + 17 bytes a row."""
+    """Return an empty ring of `capacity` rows of 4 (S + A) + 17 bytes each."""
     count = jnp.zeros((), jnp.int32)
     return Replay(
         obs=jnp.zeros((capacity, spec.obs_size)),
@@ -47,19 +47,18 @@ def init(spec: Spec, capacity: int) -> Replay:
 
 
 def append(replay: Replay, step: Transition, min_episode_steps: int = 1) -> Replay:
-    """Store one step: its row, and its outcome in the next row, which the episode's next step will complete.
+    """Store one step in its row, and the next observation in the next row, which the following step completes.
 
-    A step can be drawn once `min_episode_steps` steps of its episode are there, counted from the step on. With 1 every
-    step can be drawn; with more, the last `min_episode_steps` - 1 of an episode never can (as in released code that
-    clears its n-step window at the end of an episode).
+    A step can be sampled once its episode has `min_episode_steps` steps from it on. The last `min_episode_steps` - 1
+    never can, as in released code that clears its n-step window at the end of an episode.
     """
     capacity = replay.obs.shape[0]
     here, after = replay.rows % capacity, (replay.rows + 1) % capacity
-    rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps its last observation's row
-    moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before it is written, or all is copied
+    rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps the row of its last observation
+    moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before the write, or XLA copies the array
     row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (min_episode_steps - 1))
     steps, lost = replay.steps + (moment >= min_episode_steps), replay.lost
-    for _ in range(2):  # at most two rows are overwritten
+    for _ in range(2):  # a step overwrites at most two rows
         lost += ((lost < steps) & (row_of[lost % capacity] <= rows - capacity)).astype(jnp.int32)
     return Replay(
         obs=replay.obs.at[here].set(step.obs).at[after].set(step.next_obs),
@@ -76,22 +75,22 @@ def append(replay: Replay, step: Transition, min_episode_steps: int = 1) -> Repl
 
 
 def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden: Int[Array, ""]) -> Window:
-    """Draw windows around uniformly drawn steps; they never cross the border of an episode.
+    """Sample windows around uniformly drawn steps. No window crosses the boundary of an episode.
 
     Args:
         replay: a ring with at least one step whose outcome has arrived.
         key: random key.
-        batch: how many windows.
-        delay: Δ, the rows before the step.
-        ahead: the rows after it; the longest k of a k-step target.
-        hidden: how many of the newest observations have not arrived yet: the learner's age, 0 if it may see all.
+        batch: number of windows.
+        delay: Δ, the number of rows before the step.
+        ahead: number of rows after the step, which is the longest k of a k-step target.
+        hidden: number of newest observations that have not arrived yet: the learner's age, 0 if it may see them all.
 
     Returns:
         Windows with a leading axis `batch`.
     """
     capacity = replay.obs.shape[0]
     pick, length = jax.random.split(key)
-    # in a full ring the Δ rows before the oldest steps may be overwritten: those steps are not drawn
+    # the oldest steps of a full ring are not drawn: the Δ rows before them may be overwritten
     first = jnp.where(replay.lost > 0, replay.lost + delay, 0)
     last = replay.steps - hidden
     step = jax.random.randint(pick, (batch, 1), jnp.minimum(first, last - 1), last)
@@ -102,10 +101,10 @@ def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden:
     offset = jnp.arange(-delay, ahead + 1)
     index = (row + offset) % capacity
     moment = replay.moment[row % capacity] + offset
-    # in a row of another episode the count of moments does not go on
+    # rows of another episode do not continue the count of moments
     valid = (moment >= 0) & (replay.moment[index] == moment) & (row + offset <= newest)
     lead = (valid & (offset > 0)).sum(1)
-    acted = valid & (offset < lead[:, None])  # the last row has no action yet, or never
+    acted = valid & (offset < lead[:, None])  # the last row has no action, or not yet
     drawn = jax.random.randint(length, (batch,), 1, max(ahead, 1) + 1)
     return Window(
         obs=jnp.where(valid[..., None], replay.obs[index], 0),

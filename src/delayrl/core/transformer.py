@@ -1,4 +1,4 @@
-"""The causal transformer of VDPO, as pure functions on plain trees of arrays."""
+"""VDPO's causal transformer, as pure functions on pytrees."""
 
 import itertools
 import math
@@ -13,20 +13,20 @@ from delayrl.core.types import Key
 
 
 def layer_norm(params: Params, x: Float[Array, "*batch width"]) -> Float[Array, "*batch width"]:
-    """Normalise the last axis; ε = 1e-5."""
+    """Normalise the last axis (ε = 1e-5), then scale and shift it."""
     centred = x - x.mean(-1, keepdims=True)
     return centred * jax.lax.rsqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * params["scale"] + params["shift"]
 
 
 def dropout(kept: Bool[Array, "*shape"] | None, rate: float, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Zero the entries that are not kept and scale up the rest; without a mask, nothing."""
+    """Zero the entries that are not kept and scale up the rest. Without a mask, return `x` unchanged."""
     return x if kept is None else jnp.where(kept, x * (1 / (1 - rate)), 0)
 
 
 def threefry(key: Key, count: int) -> UInt32[Array, "2 count"]:
-    """Threefry-2x32 with 20 rounds of the counters 0..2·count - 1: the bits of `jax.random`.
+    """Return the random bits of `jax.random`: Threefry-2x32 with 20 rounds on the counters 0..2·count - 1.
 
-    JAX's own runs on one core, as a loop over the rounds that writes all words to memory in each.
+    JAX's implementation runs on one core, as a loop over the rounds that writes all words to memory in each round.
     """
     first, second = jax.random.key_data(key)
     keys = (first, second, first ^ second ^ jnp.uint32(0x1BD11BDA))
@@ -37,13 +37,13 @@ def threefry(key: Key, count: int) -> UInt32[Array, "2 count"]:
             x = x + y
             y = x ^ (y << rotation | y >> (32 - rotation))
         x, y = x + keys[(i + 1) % 3], y + keys[(i + 2) % 3] + jnp.uint32(i + 1)
-    return jax.lax.optimization_barrier(jnp.stack([x, y]))  # else each layer computes its share twice
+    return jax.lax.optimization_barrier(jnp.stack([x, y]))  # or each layer computes its share twice
 
 
 def dropout_masks(key: Key, rate: float, shapes: Sequence[tuple[int, ...]]) -> list[Bool[Array, "..."]]:
-    """What dropout keeps, for all layers from one draw: 16 random bits an entry, the rate to within 2⁻¹⁷.
+    """Sample the dropout masks of all layers at once, with 16 random bits per entry and the rate to within 2⁻¹⁷.
 
-    Four times cheaper than a `jax.random.bernoulli` for each layer, which spends 64 bits of Threefry on an entry.
+    This is four times cheaper than a `jax.random.bernoulli` per layer, which spends 64 bits of Threefry on each entry.
     """
     sizes = [math.prod(shape) for shape in shapes]
     bits = jax.lax.bitcast_convert_type(threefry(key, -(-sum(sizes) // 4)), jnp.uint16).reshape(-1)
@@ -52,7 +52,7 @@ def dropout_masks(key: Key, rate: float, shapes: Sequence[tuple[int, ...]]) -> l
 
 
 def transformer_init(key: Key, obs_size: int, action_size: int, length: int, width: int, layers: int) -> Params:
-    """Weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform: as the released code of VDPO."""
+    """Initialise as VDPO's code: weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform."""
     normal_key, uniform_key = jax.random.split(key)
     square = (width, width)
     shapes = [(obs_size, width), (action_size, width), (2 * width, width), (length, width), *[square] * (3 * layers)]
@@ -93,23 +93,23 @@ def transformer(
     rate: float = 0.0,
     key: Key | None = None,
 ) -> Float[Array, "*batch length width"]:
-    """Causal transformer of VDPO (§3.3): token i joins the last observation with the i-th action since.
+    """Apply VDPO's causal transformer (§3.3): token i joins the last observation with the i-th action since.
 
-    Position i depends on `obs` and actions 0..i only: it serves the delay i + 1, and padding at the end has no
-    influence before it. One head; post-embedding layer norm; each block overwrites its stream by its first layer norm.
+    Position i depends only on `obs` and actions 0..i. It serves the delay i + 1, and padding at the end does not affect
+    it. One head; layer norm after the embedding; each block replaces its stream by its first layer norm.
 
     Args:
-        params: of `transformer_init`.
+        params: from `transformer_init`.
         obs: the last observation that has arrived.
         actions: the actions taken since, oldest first.
-        rate: dropout rate, in embedding, attention and residuals alike.
-        key: for dropout; None switches it off.
+        rate: dropout rate of embedding, attention and residuals.
+        key: random key for dropout; None disables it.
     """
     length, width = params["position"].shape
     stream, square = (*obs.shape[:-1], length, width), (*obs.shape[:-1], length, length)
     shapes = [stream, *[square, stream, stream] * len(params["blocks"])]
     masks = iter(dropout_masks(key, rate, shapes) if key is not None and rate > 0 else [None] * len(shapes))
-    # join([e_obs, e_action]) as two products: the observation's half is the same for every token
+    # split join([e_obs, e_action]) into two products: the observation's half is the same for every token
     w_obs, w_action = jnp.split(params["join"]["w"], 2)
     from_obs = linear(params["obs"], obs) @ w_obs
     from_actions = linear({"w": w_action, "b": params["join"]["b"]}, linear(params["action"], actions))

@@ -1,7 +1,7 @@
-"""What flows through the program, with the shapes in the annotations.
+"""Data types of training, with shapes in the annotations.
 
-Axis names: `obs` (S) and `action` (A) are a task's sizes, `delay` is Δ, the longest age, `time` the length of a window
-(Δ + 1 + ahead). Leading axes (seeds, a batch) are added by `jax.vmap`; the code is written for one.
+Axes: `obs` (S) and `action` (A) are the task's sizes, `delay` is Δ, the longest age, and `time` is the length of a
+window (Δ + 1 + ahead). `jax.vmap` adds the leading axes (seeds, a batch); the code is written for one.
 """
 
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ Action = Float[Array, " action"]
 
 @dataclass(frozen=True)
 class Spec:
-    """What an agent must know of its task: sizes, and the longest age Δ of an observation, in steps."""
+    """The task as an agent needs it: its sizes, and the longest age Δ of an observation, in steps."""
 
     obs_size: int
     action_size: int
@@ -25,10 +25,10 @@ class Spec:
 
 
 class Seen(NamedTuple):
-    """What an actor sees: the augmented state x_t, and the true state where the agent is privileged.
+    """The augmented state x_t that an actor sees, with the true state if the agent is privileged.
 
-    `actions` holds the actions taken since `obs` was made, oldest first, zeros after the first `age`; all actions are
-    scaled to [-1, 1]. `truth` is None for whoever may not look: reading it is then an error, not a leak.
+    `actions` holds the actions taken since `obs` was made, oldest first, and zeros after the first `age`. All actions
+    are scaled to [-1, 1]. `truth` is None if the actor may not see it, so that reading it is an error and not a leak.
     """
 
     obs: Float[Array, " obs"]
@@ -38,10 +38,10 @@ class Seen(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One true environment step, as it is stored: from `obs` by `action` to `next_obs`.
+    """One undelayed environment step, as stored: `action` leads from `obs` to `next_obs`.
 
-    `age` is the age of what the actor saw when it acted, `next_age` of what it saw next; `terminated` ends the
-    episode's value, `done` (terminated or truncated) only the episode.
+    `age` is the age of the observation on which the actor acted, `next_age` that of the next one it saw. `terminated`
+    means that no value follows; `done` (terminated or truncated) means only that the episode ends.
     """
 
     obs: Float[Array, " obs"]
@@ -57,10 +57,10 @@ class Transition(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Window:
-    """A stretch of one episode around the step t that is learned from; t stands at index Δ.
+    """A stretch of one episode around the sampled step t, which is at index Δ.
 
-    Rows outside the episode, or not arrived yet, are zeros and not `valid`. `lead` counts the valid rows after t.
-    `n_step` is the length k ≤ `lead` of this sample's k-step target, drawn from 1..ahead.
+    Rows that lie outside the episode, or have not arrived yet, are zero and not `valid`. `lead` counts the valid rows
+    after t. `n_step` is the length k of this sample's k-step target, drawn from 1..ahead and limited to `lead`.
     """
 
     obs: Float[Array, "time obs"]
