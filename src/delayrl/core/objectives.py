@@ -34,7 +34,7 @@ def soft_value(
 def temperature_loss(
     log_temperature: Float[Array, ""], log_prob: Float[Array, "*batch"], target_entropy: float
 ) -> Float[Array, ""]:
-    """Return -α (log π + H̄), whose gradient raises α while the entropy is below H̄ (SAC, eq. 18)."""
+    """Return -α (log π + H̄). Minimising it raises α while the entropy is below H̄ (SAC, eq. 18)."""
     return -(jnp.exp(log_temperature) * (log_prob + target_entropy)).mean()
 
 

@@ -37,7 +37,7 @@ def threefry(key: Key, count: int) -> UInt32[Array, "2 count"]:
             x = x + y
             y = x ^ (y << rotation | y >> (32 - rotation))
         x, y = x + keys[(i + 1) % 3], y + keys[(i + 2) % 3] + jnp.uint32(i + 1)
-    return jax.lax.optimization_barrier(jnp.stack([x, y]))  # or each layer computes its share twice
+    return jax.lax.optimization_barrier(jnp.stack([x, y]))  # otherwise each layer computes its share twice
 
 
 def dropout_masks(key: Key, rate: float, shapes: Sequence[tuple[int, ...]]) -> list[Bool[Array, "..."]]:
@@ -52,7 +52,7 @@ def dropout_masks(key: Key, rate: float, shapes: Sequence[tuple[int, ...]]) -> l
 
 
 def transformer_init(key: Key, obs_size: int, action_size: int, length: int, width: int, layers: int) -> Params:
-    """Initialise as VDPO's code: weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform."""
+    """Initialise as in VDPO's code: weights N(0, 0.02²), biases 0, layer norms 1 and 0; q, k, v Xavier-uniform."""
     normal_key, uniform_key = jax.random.split(key)
     square = (width, width)
     shapes = [(obs_size, width), (action_size, width), (2 * width, width), (length, width), *[square] * (3 * layers)]
