@@ -155,8 +155,8 @@ def test_under_the_loop() -> None:
     states = run()
     for step in range(1, 32):
         assert list(states[step - 1].steps) == [step if step > 8 else 0] * 2
-    learned = [step for step in range(2, 32) if not same(states[step - 1].student, states[step - 2].student)]
-    assert learned == [20, 30]
+    imitated = [step for step in range(2, 32) if not same(states[step - 1].student, states[step - 2].student)]
+    assert imitated == [20, 30]
     improved = [step for step in range(2, 32) if not same(states[step - 1].reference, states[step - 2].reference)]
     assert improved == list(range(9, 21))
     assert same(states[-1], run()[-1])

@@ -113,7 +113,7 @@ def test_view_ahead_is_the_next_view() -> None:
     delay = 4
     replay, transitions, shown = filled(150, delay, 400)
     windows = draw(replay, 500, delay, 3)
-    views = jax.vmap(lambda w: view(w, w.steps))(windows)
+    views = jax.vmap(lambda w: view(w, w.n_step))(windows)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     checked = 0
     for i, action in enumerate(np.asarray(windows.action[:, delay, 0]).tolist()):
