@@ -14,11 +14,11 @@ sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "speed")]
 
 import floor  # noqa: E402
 import operations  # noqa: E402
-import run  # noqa: E402
 import worker  # noqa: E402
 from speed import tables  # noqa: E402
 from works import SIZES, WORKS, Work  # noqa: E402
 
+import run  # noqa: E402
 from delayrl.agents.sac import SAC  # noqa: E402
 from delayrl.core import replay as ring  # noqa: E402
 from delayrl.core.types import Spec  # noqa: E402
