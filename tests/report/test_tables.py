@@ -1,22 +1,24 @@
 """Tables in the paper's layout, and the paper's values beside ours."""
 
 import math
+from typing import Any
 
-from synthetic import anchored, small, standing
+import pytest
+from synthetic import small, standing
 
 from delayrl.report.summary import summarise
 from delayrl.report.tables import published_values
 
 
 def test_columns_that_were_not_run_are_empty_beside_the_papers_value() -> None:
-    cells = small()
-    summary = summarise(anchored(cells), [*cells.values()])
-    table = summary.tables[0]
+    normalised, steps = summarise([], [*small(steps=1_000_000).values()]).tables
+    table = normalised
     assert table.columns == ["a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo"]
     entry = table.entries["delayrl/Ant-v4", 5, "bpql"]
     assert math.isnan(entry.value)
     assert math.isnan(entry.raw)
     assert entry.published == ("2", 0.96, 0.03)
+    assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].published[:2] == ("1", 420_000)  # type: ignore[index]
 
 
 def test_ablation_meets_the_papers_columns() -> None:
@@ -30,6 +32,30 @@ def test_ablation_meets_the_papers_columns() -> None:
         "vdpo representation=mlp": ("3", 0.86),
         "vdpo representation=transformer-no-belief": ("3", 1.09),
     }
+
+
+@pytest.mark.parametrize("changes", [{"preset": "small"}, {"steps": 20_000}, {"overrides": {"n_steps": 1}}])
+def test_the_papers_values_stand_only_beside_runs_like_the_papers(changes: dict[str, Any]) -> None:
+    """Of the paper's preset, for as many steps, with its hyperparameters; no column is there for its agents either."""
+    cells = [standing("vdpo", "delayrl/Ant-v4", 5, **changes), standing("bpql", "delayrl/Ant-v4", 5, **changes)]
+    for table in summarise([], cells).tables:
+        published = {label: table.entries["delayrl/Ant-v4", 5, label].published for label in table.columns}
+        if "overrides" in changes:
+            assert published.pop("dida").table in ("1", "2")
+            assert [published[label] for label in ("vdpo", "bpql")] == [None, None]
+        else:
+            assert published == {"vdpo": None, "bpql": None}
+
+
+def test_the_ablation_shows_no_value_of_another_variant() -> None:
+    """Table 3 varies the representation alone: its transformer is not `direction=forward`."""
+    overrides = [{}, {"direction": "forward"}, {"representation": "mlp"}, {"evaluate_every": 20_000}]
+    summary = summarise([], [standing("vdpo", "Ant-v4", 5, overrides=o) for o in overrides])
+    (table,) = [table for table in summary.tables if table.kind == "ablation"]
+    published = {label: table.entries["Ant-v4", 5, label].published for label in table.columns}
+    assert published["vdpo direction=forward"] is None
+    assert published["vdpo"] == published["vdpo evaluate_every=20000"] == ("3", 1.11, 0.04)
+    assert published["vdpo representation=mlp"] is not None
 
 
 def test_stochastic_delays_have_their_table() -> None:

@@ -108,11 +108,7 @@ def descend(
     opt_state: optax.OptState,
     *args: Any,
 ) -> tuple[Params, optax.OptState, Any, Any]:
-    """Take one step of gradient descent on `loss(params, *args) -> (value, extra)`.
-
-    Returns:
-        The new parameters, the new optimiser state, the loss and the extra.
-    """
+    """Descend `loss(params, *args) -> (value, extra)` by one step; return parameters, `opt_state`, value and extra."""
     (value, extra), gradient = jax.value_and_grad(loss, has_aux=True)(params, *args)
     change, opt_state = optimiser.update(gradient, opt_state, params)
     return optax.apply_updates(params, change), opt_state, value, extra

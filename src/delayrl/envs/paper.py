@@ -116,9 +116,7 @@ def restore_physics(base: Any) -> None:
     installed, model = mujoco.__version__, base.model
     version = tuple(int(part) for part in re.findall(r"\d+", installed)[:3])
     if not OLDEST <= version < TOO_NEW:
-        raise DelayRLError(
-            f"the paper tasks need another MuJoCo; {installed} is installed: pip install 'mujoco>=3.2.7,<4'"
-        )
+        raise DelayRLError(f"the paper tasks need another MuJoCo than {installed}: pip install 'mujoco>=3.2.7,<4'")
     for flag in ("mjDSBL_NATIVECCD", "mjDSBL_MULTICCD"):  # versions without these flags lack the algorithms too
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, flag, 0))
     if version >= MARGINS_SUMMED:

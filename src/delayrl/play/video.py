@@ -11,13 +11,9 @@ from delayrl.errors import DelayRLError, first_line
 
 
 def watch(run: Path, out: Path, delay: int | str | None = None, seed: int = 0) -> tuple[int, float]:
-    """Play one episode of a run's policy, and write it to an .mp4 or .gif file.
+    """Play one episode of a run's policy, and write it to an .mp4 or .gif file. Returns the frames and the return.
 
-    Returns:
-        The number of frames, and the return.
-
-    Raises:
-        DelayRLError: another kind of file, no run, a delay longer than in training, or no way to render.
+    Raises DelayRLError for another kind of file, no run, a delay longer than in training, or no way to render.
     """
     if out.suffix not in (".mp4", ".gif"):
         raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")

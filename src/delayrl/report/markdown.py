@@ -19,7 +19,7 @@ GREY = '<span style="color:#888">{}</span>'
 def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequence[Mapping[str, Any]] = ()) -> str:
     """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
     legend = "† reads the true state while it trains. ± is the standard deviation over seeds."
-    parts = [f"# {_escape(title)}", f"{wording.states(summary)}. {legend} {wording.PAPER}"]
+    parts = [f"# {_escape(title)}", f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip()]
     if summary.unplaced:
         parts.append(f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out.")
     parts += [_escape(line) for line in wording.overrides(summary) + wording.made_with(versions)]

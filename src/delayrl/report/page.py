@@ -55,7 +55,7 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "state": wording.states(summary),
         "counts": Counter(r.progress.state for r in results),
         "notes": notes,
-        "paper": wording.PAPER.replace("`", ""),
+        "paper": wording.paper(summary).replace("`", ""),
         "settings": [s._asdict() | {"seeds": seeds[s]} for s in settings],
         "tasks": tasks,
         "delays": delays,

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -15,6 +15,8 @@ from delayrl.report.results import PAPER_ORDER, Place, Result, Setting, agent_or
 from delayrl.report.statistics import NAN
 
 Kind = Literal["normalised", "steps", "ablation", "stochastic"]
+PAPER_STEPS = 1_000_000
+SAME_RUN = {"representation", "steps", "evaluate_every", "evaluation_episodes"}  # overrides that the paper's runs allow
 
 
 class PublishedValue(NamedTuple):
@@ -86,13 +88,13 @@ def make_tables(results: Mapping[Place, Result]) -> list[Table]:
     return [table for table in tables if table.rows]
 
 
-def _table(
-    kind: Kind, title: str, setting: Setting, chosen: Iterable[Result], results: Mapping[Place, Result]
-) -> Table:
-    """Lay out the chosen results. A column of the paper is there wherever the paper has a value for it."""
+def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], results: Mapping[Place, Result]) -> Table:
+    """Lay out the chosen results. The paper's columns and values are there only if all have its preset and budget."""
     rows = sorted({(r.place.env, r.place.delay) for r in chosen}, key=lambda row: (row[0], delay_order(row[1])))
     columns = {r.place.label for r in chosen}
-    in_paper = {(task, delay) for _, task, delay, *_ in published_values()}
+    comparable = setting.preset == "paper" and all(r.condition.steps >= PAPER_STEPS for r in chosen)
+    values = published_values() if comparable else {}
+    in_paper = {(task, delay) for _, task, delay, *_ in values}
     if kind != "ablation" and any((env.removeprefix("delayrl/"), str(delay)) in in_paper for env, delay in rows):
         agents = {column.split(" ")[0] for column in columns}
         columns |= {agent for agent in PAPER_ORDER if agent not in agents}
@@ -105,7 +107,8 @@ def _table(
         if kind != "ablation" and representation == "transformer":
             representation = ""  # only values of the ablation name one
         measure = "steps" if kind == "steps" else "normalised"
-        published = published_values().get((measure, env.removeprefix("delayrl/"), str(delay), agent, representation))
+        key = (measure, env.removeprefix("delayrl/"), str(delay), agent, representation)
+        published = values.get(key) if overrides.keys() <= SAME_RUN else None  # the paper ran no other variants
         entries[env, delay, label] = _entry(kind, results.get(Place(setting, env, delay, label)), published)
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
 

@@ -58,6 +58,11 @@ def source(table: Table) -> str:
     return f"Paper: Table{'s' * (len(numbers) > 1)} {', '.join(numbers)}." if numbers else ""
 
 
+def paper(summary: Summary) -> str:
+    """Name the paper if a table shows values of it."""
+    return PAPER if any(source(table) for table in summary.tables) else ""
+
+
 def states(summary: Summary) -> str:
     """Write how many cells are done, running, failed and to do."""
     number_of = Counter(result.progress.state for result in summary.results.values())
