@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conftest import record
+from conftest import learned, record
 from delayrl.agents.dida import DIDA
 from delayrl.agents.sac import SAC
 from delayrl.core import replay as ring

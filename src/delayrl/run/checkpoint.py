@@ -38,7 +38,7 @@ class Checkpoint:
         for name, checksum in (self.files | self.pieces).items():
             file = (replay if name in self.pieces else self.path) / name
             if Path(name).name != name or "\0" in name or _checksum(file) != checksum:
-                raise DelayRLError(f"{name!r} is cut or changed")
+                raise DelayRLError(f"{name} is cut or changed")
 
 
 def checkpoint_folders(run: Path) -> list[Path]:
