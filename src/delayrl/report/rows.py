@@ -11,9 +11,8 @@ from typing import Any
 
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
-from delayrl.run.rows import Row
+from delayrl.run.rows import CONDITION, Row
 
-CONDITION_COLUMNS = tuple(Condition("", "", 0).columns)
 LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
 
 
@@ -53,7 +52,7 @@ class RowGroup:
 def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
     """Check rows and sum them up, in one pass. Raises DelayRLError if one lacks a column, is damaged or there twice."""
     groups: dict[tuple[Any, ...], RowGroup] = {}
-    columns = itemgetter(*CONDITION_COLUMNS, "seed", "step", "policy", "episode", "return")
+    columns = itemgetter(*CONDITION, "seed", "step", "policy", "episode", "return")
     for number, row in enumerate(rows, 1):
         try:
             *condition, seed, step, policy, episode, value = columns(row)
@@ -78,7 +77,7 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
 
 
 def _group(row: Mapping[str, Any]) -> RowGroup:
-    condition = Condition.from_json({name: row[name] for name in CONDITION_COLUMNS} | {"overrides": {}, "steps": 0})
+    condition = Condition.from_json({name: row[name] for name in CONDITION} | {"overrides": {}, "steps": 0})
     if isinstance(condition.delay, bool) or (isinstance(condition.delay, int) and abs(condition.delay) >= 2**31):
         raise ValueError
     cell = row.get("cell")
@@ -100,7 +99,7 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
                         if not isinstance(row, dict):
                             raise TypeError
                         if "config" in row:
-                            names = (*CONDITION_COLUMNS, "privileged", "seed")
+                            names = (*CONDITION, "privileged", "seed")
                             configs[row["run"]] = {name: row["config"][name] for name in names}
                         elif "step" in row:
                             yield configs.get(row.get("run"), {}) | row
