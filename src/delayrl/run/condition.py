@@ -81,8 +81,21 @@ class Setup:
 
     def cell_id(self, seeds: Sequence[int]) -> str:
         """Return the name of a group of seeds: a hash of the configuration, however the user wrote it."""
-        parts = {name: value for name, value in self.config.items() if name != "privileged"} | {"seeds": list(seeds)}
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
+        return _digest(self._decisive | {"seeds": list(seeds)})
+
+    @property
+    def configuration(self) -> str:
+        """Return a hash of all options. Rows name it: with their other columns it says what was trained, but the seed."""
+        return _digest({name: self._decisive[name] for name in ("hyperparameters", "schedule")})
+
+    @property
+    def _decisive(self) -> dict[str, Any]:
+        """The part of the configuration that ids are made of."""
+        return {name: value for name, value in self.config.items() if name != "privileged"}
+
+
+def _digest(parts: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, overrides: Mapping[str, Any]) -> Setup:
