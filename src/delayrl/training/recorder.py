@@ -21,7 +21,10 @@ class Recorder:
     def __init__(self, group: Group, agent: State, env: Any, track: str | None) -> None:
         self._group = group
         setup = group.setup
-        self._columns = setup.condition.columns | {"privileged": setup.agent.privileged}
+        self._columns = setup.condition.columns | {
+            "privileged": setup.agent.privileged,
+            "configuration": setup.configuration,
+        }
         self._physics = physics(env)
         self._trackers = [Tracker(track, run.path) for run in group.runs]
         name, delay = setup.condition.env, setup.delay
