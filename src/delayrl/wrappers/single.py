@@ -145,8 +145,13 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         return obs, reward, terminated, truncated, info
 
     def draw_from(self, seed: int) -> None:
-        """Take the delays of the current episode from another seed than the task's. Call it right after `reset`."""
+        """Take the delays of the current episode, and the random actions of `NoisyActions`, from another seed.
+
+        Call it right after `reset`.
+        """
         self._transit.random = np.random.default_rng([seed, 1])
+        if self.env.has_wrapper_attr("draw_from"):
+            self.env.get_wrapper_attr("draw_from")(seed)
 
     def _show(self) -> tuple[NDArray[Any], Info]:
         obs, age, recent, applied = self._transit.shown()
