@@ -18,6 +18,7 @@ from delayrl.run.configuration import values_of
 from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
+from delayrl.training.cost import cost_of
 from delayrl.training.learner import Stored
 from delayrl.training.state import Group, TrainState
 
@@ -43,9 +44,11 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
         elif run not in replaced and not run.is_free:
             raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
     checkpoints = _common_checkpoints(runs, note)
+    config |= {"configuration": group.setup.configuration, "versions": versions()}
     for run, seed in zip(runs, group.seeds, strict=True):
         if not run.exists:
-            run.create(config | {"seed": seed, "versions": versions()})
+            cost = cost_of(group.setup.agent, group.spec, group.setup.schedule)
+            run.create(config | {"seed": seed, "cost": cost.json})
     learner = group.program.init(group.keys, group.setup.schedule.replay_capacity)
     state = TrainState(0, learner, actors, [], None, [{} for _ in runs], [(0, 0) for _ in runs])
     if not checkpoints:
