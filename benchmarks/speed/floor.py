@@ -28,46 +28,11 @@ from delayrl.play.policy import spec_of
 from delayrl.run.configuration import override
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers
+from delayrl.training.products import matmul_flops
 from delayrl.training.train import on_device
 
 ROWS = 2_000
 """Rows of the replay for timing the parts. They fit into the caches, unlike a full replay, but a batch is small."""
-
-
-def matmul_flops(function: Callable[..., Any], *args: Any) -> float:
-    """Count the multiplications and additions of all matrix products of a function on arguments of these shapes.
-
-    A loop counts as often as it runs. A branch counts as the mean of its cases: SAC's actor learns at every second
-    update.
-    """
-    return _products(jax.make_jaxpr(function)(*args).jaxpr)
-
-
-def _products(jaxpr: Any) -> float:
-    total = 0.0
-    for equation in jaxpr.eqns:
-        name, params = equation.primitive.name, equation.params
-        if name == "dot_general":
-            (contracted, _), _ = params["dimension_numbers"]
-            inner = math.prod(equation.invars[0].aval.shape[axis] for axis in contracted)
-            total += 2 * inner * math.prod(equation.outvars[0].aval.shape)
-        elif name == "cond":
-            branches = [_products(branch.jaxpr) for branch in params["branches"]]
-            total += sum(branches) / len(branches)
-        elif name == "while":
-            raise NotImplementedError("a loop of unknown length; write it as a scan")
-        else:
-            inside = sum(_products(x) for value in params.values() for x in _jaxprs(value))
-            total += inside * (params["length"] if name == "scan" else 1)
-    return total
-
-
-def _jaxprs(value: Any) -> list[Any]:
-    if hasattr(value, "eqns"):
-        return [value]
-    if hasattr(value, "jaxpr"):
-        return [value.jaxpr]
-    return [x for item in value for x in _jaxprs(item)] if isinstance(value, tuple | list) else []
 
 
 def amortised(phases: list[tuple[int, int, float]]) -> float:

@@ -3,14 +3,12 @@
 import ctypes
 import sys
 import threading
-from collections.abc import Iterator
-from typing import Any
 
 import jax
 
 from delayrl.agents.base import Agent
 from delayrl.core.types import Spec
-from delayrl.training.estimate import update_shapes
+from delayrl.training.products import follow, traced_updates
 
 LARGE = 50 * 2**20
 """Bytes of an update's matrix products from which keeping the buffers is faster (measured).
@@ -45,16 +43,6 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
 
 def product_bytes(agent: Agent, spec: Spec) -> list[int]:
     """Return for each phase the bytes of the matrix products of one update. Touches no device."""
-    shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
-    return [sum(_products(jax.jit(phase.update).trace(*args).jaxpr)) for phase, args in shapes]
-
-
-def _products(jaxpr: Any) -> Iterator[int]:
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            yield from (x.aval.size * x.aval.dtype.itemsize for x in equation.outvars)
-        for value in equation.params.values():
-            for inner in value if isinstance(value, tuple | list) else [value]:
-                inner = getattr(inner, "jaxpr", inner)  # closed or not
-                if hasattr(inner, "eqns"):
-                    yield from _products(inner)
+    programs = [program for _, program in traced_updates(agent, spec)]
+    results = [[x.aval for product in follow(program)[0] for x in product.equation.outvars] for program in programs]
+    return [sum(x.size * x.dtype.itemsize for x in of_phase) for of_phase in results]

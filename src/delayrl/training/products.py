@@ -1,0 +1,140 @@
+"""Matrix products of a program, and how often it runs them, found from its trace: nothing is compiled or computed."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import Literal
+from numpy.typing import NDArray
+
+from delayrl.agents.base import Agent, Phase
+from delayrl.core.types import Spec
+from delayrl.training.estimate import update_shapes
+
+Value = NDArray[Any] | None
+"""A scalar of a program in each of C updates, [C] or one for all; None if it depends on data."""
+
+
+class Product(NamedTuple):
+    """A matrix product: its equation, and how often it runs in each of C updates, [C] or a number."""
+
+    equation: Any
+    times: NDArray[np.float64] | float
+
+    @property
+    def flops(self) -> float:
+        """Its multiplications and additions, in the mean over the updates."""
+        (contracted, _), _ = self.equation.params["dimension_numbers"]
+        inner = math.prod(self.equation.invars[0].aval.shape[axis] for axis in contracted)
+        return float(2 * inner * math.prod(self.equation.outvars[0].aval.shape) * np.mean(self.times))
+
+
+SCALAR: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "rem": np.fmod,
+    "div": lambda a, b: np.trunc(a / b),  # of integers, as XLA rounds them
+    "convert_element_type": np.asarray,
+    "sign": np.sign,
+    "min": np.minimum,
+    "max": np.maximum,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "not": np.invert,
+    "select_n": lambda which, *cases: np.choose(np.asarray(which, int), cases),
+}
+"""The operations that decide which branch an update takes."""
+
+
+@functools.lru_cache(4)  # a run needs the traces twice
+def traced_updates(agent: Agent, spec: Spec) -> list[tuple[Phase, Any]]:
+    """Return each phase with the program of its update for one seed. Touches no device."""
+    shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
+    return [(phase, jax.jit(phase.update).trace(*args).jaxpr.jaxpr) for phase, args in shapes]
+
+
+def matmul_flops(function: Callable[..., Any], *args: Any) -> float:
+    """Count the multiplications and additions of all matrix products of a function on arguments of these shapes."""
+    products, _ = follow(jax.make_jaxpr(function)(*args).jaxpr)
+    return sum(product.flops for product in products)
+
+
+def follow(program: Any, inputs: Sequence[Value] = ()) -> tuple[list[Product], list[Value]]:
+    """Follow a program: find its matrix products, and compute its integers as far as they are known.
+
+    A branch counts where it is taken, or, if that depends on data, as the mean of its cases. A loop counts as often as
+    it runs: NaN times if that depends on data.
+
+    Args:
+        program: a jaxpr.
+        inputs: its inputs, None where they are unknown; empty if all are.
+
+    Returns:
+        The products, and the outputs as far as they are known.
+    """
+    known: dict[Any, Value] = dict(zip(program.invars, inputs, strict=bool(inputs)))
+    products: list[Product] = []
+
+    def value(x: Any) -> Value:
+        if not isinstance(x, Literal):
+            return known.get(x)
+        return np.asarray(x.val) if np.shape(x.val) == () else None
+
+    for equation in program.eqns:
+        name, params = equation.primitive.name, equation.params
+        values = [value(x) for x in equation.invars]
+        outputs: Sequence[Value] = ()
+        if name == "dot_general":
+            products.append(Product(equation, 1.0))
+        elif name == "cond":
+            found, outputs = _follow_branches(params["branches"], *values)
+            products += found
+        elif name in SCALAR and all(x is not None for x in values):
+            outputs = [SCALAR[name](*values)] if equation.outvars[0].aval.shape == () else ()
+        else:
+            for inside in _programs(list(params.values())):
+                once = name not in ("scan", "while") and len(inside.invars) == len(values)
+                found, outputs = follow(inside, values if once else ())
+                outputs = outputs if once else ()
+                repeats = np.nan if name == "while" else params.get("length", 1)
+                products += [Product(p.equation, p.times * repeats) for p in found]
+        known |= zip(equation.outvars, outputs, strict=bool(outputs))
+    return products, [value(x) for x in program.outvars]
+
+
+def _follow_branches(branches: Sequence[Any], index: Value, *inputs: Value) -> tuple[list[Product], list[Value]]:
+    products, results = [], []
+    for number, branch in enumerate(branches):
+        found, outputs = follow(branch.jaxpr, inputs)
+        taken = 1 / len(branches) if index is None else (index == number).astype(float)
+        products += [Product(p.equation, p.times * taken) for p in found]
+        results.append(outputs)
+    values = [_merge(index, xs) for xs in zip(*results, strict=True)]
+    return products, values
+
+
+def _merge(index: Value, values: Sequence[Value]) -> Value:
+    """Return an output of branches: of the branch that is taken, NaN where that is unknown; else the mean of all."""
+    if all(x is None for x in values) or (index is None and any(x is None for x in values)):
+        return None
+    if index is None:
+        return np.mean(np.broadcast_arrays(*values), axis=0)  # type: ignore[arg-type]
+    return np.choose(index, [np.nan if x is None else x for x in values])
+
+
+def _programs(values: Any) -> list[Any]:
+    """Return the programs among the parameters of an operation."""
+    if isinstance(values, tuple | list):
+        return [program for value in values for program in _programs(value)]
+    values = getattr(values, "jaxpr", values)  # closed or not
+    return [values] if hasattr(values, "eqns") else []
