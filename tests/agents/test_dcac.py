@@ -63,7 +63,8 @@ def worth(x: np.ndarray, endless: bool) -> float:
 
 
 def soft_returns(rolls: Roll, value: np.ndarray, agent: DCAC = AGENT) -> np.ndarray:
-    return np.asarray(agent.soft_return(rolls, agent.reward_scale, jnp.stack([value, value + 1.0])))
+    both = jnp.stack([value, value + 1.0])
+    return np.asarray(agent.soft_return(rolls, agent.reward_scale, agent.entropy_scale, both))
 
 
 @pytest.mark.parametrize("kind", ["terminated", "truncated"])
@@ -124,8 +125,8 @@ def test_released_formula_by_hand() -> None:
     )
     value = jnp.array([[10.0, 10.0], [9.0, 9.0]])
     # 4.5 + .99 · 11 + .9801 · 9; and of one step, at whose end the terminal state shows: 4.5, and nothing of step 2
-    np.testing.assert_allclose(AGENT.soft_return(roll, 5.0, value), [24.2109, 4.5], rtol=1e-6)
-    np.testing.assert_allclose(AGENT.soft_return(roll, 0.0, value), [-0.5 + 0.99 + 8.8209, -0.5], rtol=1e-6)
+    np.testing.assert_allclose(AGENT.soft_return(roll, 5.0, 1.0, value), [24.2109, 4.5], rtol=1e-6)
+    np.testing.assert_allclose(AGENT.soft_return(roll, 0.0, 1.0, value), [-0.5 + 0.99 + 8.8209, -0.5], rtol=1e-6)
 
 
 def test_stretch_is_the_past_with_new_actions() -> None:
@@ -184,8 +185,8 @@ def test_gradients() -> None:
     zero = jax.tree.map(jnp.zeros_like, state.critic)
 
     def gradient(agent: DCAC, critic):
-        loss = functools.partial(agent.loss, target=state.target, windows=windows, key=jax.random.key(5))
-        return jax.jit(jax.grad(lambda params: loss(params)[0]))((state.actor, critic))
+        batch = state.target, windows, jax.random.key(5), agent.entropy_scale
+        return jax.jit(jax.grad(lambda params: agent.loss(params, *batch)[0]))((state.actor, critic))
 
     def size(tree) -> float:
         return float(sum(jnp.abs(x).sum() for x in jax.tree.leaves(tree)))

@@ -76,7 +76,7 @@ def test_official_starts() -> None:
     transitions, _ = record(TASK, 2, 120)
     replay = ring.init(Spec(2, 1, 2), 500)
     for transition in transitions:
-        replay = jax.jit(ring.append, static_argnames="min_episode_steps")(replay, transition, min_episode_steps=3)
+        replay = jax.jit(ring.append, static_argnames="learnable")(replay, transition, ring.Learnable(until_end=3))
     windows = draw(replay, 20_000, 2, 3)
     assert int(windows.lead.min()) == 3
     complete = [t for t in transitions if t.obs[0] <= t.obs[1] - 3]

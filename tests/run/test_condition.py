@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from delayrl.core.replay import ALL
 from delayrl.core.types import Spec
 from delayrl.delays import Constant, Delay
 from delayrl.errors import DelayRLError
@@ -52,11 +53,12 @@ def test_protocols_are_values() -> None:
         agent: resolve(agent, "Pendulum-v1", 3, "small", "official", {}) for agent in ("vdpo", "ad-sac", "bpql")
     }
     spec = Spec(3, 1, 3)
-    assert [setup.min_episode_steps(spec) for setup in official.values()] == [3, 3, 1]
+    assert [setup.learnable(spec).until_end for setup in official.values()] == [3, 3, 1]
     assert [getattr(setup.agent, "evaluation", "mode") for setup in official.values()] == ["mode", "sample", "mode"]
-    assert {setup.protocol.time_limit for setup in official.values()} == {"terminates"}
+    limits = [setup.protocol.time_limit for setup in official.values()]
+    assert limits == ["terminates", "terminates", "bootstraps"]
     corrected = resolve("vdpo", "Pendulum-v1", 3, "small", "corrected", {})
-    assert corrected.min_episode_steps(spec) == 1
+    assert corrected.learnable(spec) == ALL
     assert resolve("ad-sac", "Pendulum-v1", 3, "small", "official", {"evaluation": "mode"}).agent.evaluation == "mode"
     with pytest.raises(DelayRLError, match="protocol must be corrected or official; got 'mine'"):
         resolve("vdpo", "Pendulum-v1", 3, "small", "mine", {})

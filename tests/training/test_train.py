@@ -112,6 +112,7 @@ def test_a_block_may_begin_before_learning_does(tmp_path: Path) -> None:
 def test_episodes_that_are_too_short_to_learn_from(tmp_path: Path) -> None:
     """Where the last n_steps - 1 steps of an episode are never drawn, and it has no more."""
     values = {"protocol": "official", "n_steps": 60, "random_steps": 140, "representation": "mlp"}
+    values["replay_capacity"] = 60 * 250
     with pytest.raises(delayrl.DelayRLError, match="no episode of Reacher-v5 is long enough"):
         train("vdpo", tmp_path / "run", **values)
 

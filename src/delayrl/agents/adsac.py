@@ -112,18 +112,19 @@ class ADSAC:
             "temperature": jnp.exp(state.log_temperature),
             "auxiliary_temperature": jnp.exp(state.auxiliary.log_temperature),
         }
-        next_value, entropies = self.next_value(state, later, auxiliary_key, augmented_key)
+        log_scale, target_entropy = self.learner.log_scale(windows), self.learner.target_entropy(windows)
+        next_value, entropies = self.next_value(state, later, auxiliary_key, augmented_key, log_scale)
         auxiliary, metrics = self.learner.learn_critic(state.auxiliary, windows, now.auxiliary, next_value)
         state = jax.lax.cond(
             count % self.learner.actor_every == self.learner.actor_every - 1,
-            lambda state: self._improve(state, now, windows.action.shape[-1], actor_key),
+            lambda state: self._improve(state, now, target_entropy, actor_key),
             lambda state: state,
             state._replace(auxiliary=auxiliary),
         )
         return state, metrics | entropies | temperatures
 
     def next_value(
-        self, state: State, later: Inputs, auxiliary_key: Key, augmented_key: Key
+        self, state: State, later: Inputs, auxiliary_key: Key, augmented_key: Key, log_scale: float = 0.0
     ) -> tuple[Float[Array, " batch"], Metrics]:
         """Return V(x^τ_{t+k}), the minimum over two pairs of actor and target critic, and the actors' entropies.
 
@@ -136,6 +137,7 @@ class ADSAC:
         )
         for i, (learner, x, key) in enumerate(learners):
             action, log_prob = networks.sample(self.learner.policy(learner.actor, x), key)
+            log_prob -= log_scale
             q = networks.twin(state.auxiliary.target, later.auxiliary, action)[i]
             values.append(q - jnp.exp(learner.log_temperature) * log_prob)
             entropies.append(-log_prob.mean())
@@ -150,7 +152,7 @@ class ADSAC:
 
         return jax.vmap(of_window)(windows, jnp.broadcast_to(ahead, windows.n_step.shape))
 
-    def _improve(self, state: State, now: Inputs, action_size: int, key: Key) -> State:
+    def _improve(self, state: State, now: Inputs, target_entropy: float, key: Key) -> State:
         """Improve a randomly chosen actor and both temperatures, `actor_updates` times, with the values of x^τ."""
         for update_key in jax.random.split(key, self.learner.actor_updates):
             coin_key, policy_key, auxiliary_key, augmented_key = jax.random.split(update_key, 4)
@@ -161,8 +163,9 @@ class ADSAC:
                 state,
                 policy_key,
             )
-            auxiliary = self.learner.adjust_temperature(state.auxiliary, now.auxiliary, action_size, auxiliary_key)
-            own = self.learner.adjust_temperature(augmented_learner(state), now.augmented, action_size, augmented_key)
+            adjust = self.learner.adjust_temperature
+            auxiliary = adjust(state.auxiliary, now.auxiliary, target_entropy, auxiliary_key)
+            own = adjust(augmented_learner(state), now.augmented, target_entropy, augmented_key)
             state = with_augmented(state._replace(auxiliary=auxiliary), own)
         return state
 

@@ -87,12 +87,18 @@ class Schedule:
     """The length of a run and the timing of what happens in it."""
 
     steps: Annotated[int, "environment steps to train"] = 1_000_000
-    random_steps: Annotated[int, "initial steps with uniformly random actions and no updates"] = 5_000
+    random_steps: Annotated[int, "initial steps with uniformly random actions"] = 5_000
+    update_after: Annotated[int, "steps before the first update; 0 for random_steps"] = 0
     replay_capacity: Annotated[int, "rows of the replay: one per step, and one more per episode"] = 1_000_000
     evaluate_every: Annotated[int, "steps between evaluations (and checkpoints)"] = 10_000
     evaluation_episodes: Annotated[int, "episodes per evaluation"] = 10
     updates_per_call: Annotated[int, "environment steps between calls to learn, which run all updates due"] = 1
     precision: Annotated[Precision, "precision of matrix products, where the device offers a choice"] = "float32"
+
+    @property
+    def first_update(self) -> int:
+        """The step of the first update."""
+        return self.update_after or self.random_steps
 
 
 def template(agent: Agent, spec: Spec) -> State:

@@ -15,7 +15,7 @@ Deviations from the paper and from the released code are numbered in docs/algori
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,19 +25,21 @@ from jaxtyping import Array, Bool, Float, Int
 from delayrl.agents.base import Agent, Deterministic, Phase, descend
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian, Params
-from delayrl.core.objectives import k_step_return, soft_target
+from delayrl.core.objectives import k_step_return, soft_target, temperature_loss
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import input_size, network_input, view
 from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Actor, critics and target critics, and the state of the optimiser that actor and critics share."""
+    """Actor, critics, target critics, the optimiser state that actor and critics share, a learned temperature's."""
 
     actor: Params
     critic: Params
     target: Params
     opt_state: optax.OptState
+    log_temperature: Float[Array, ""] | None = None
+    temperature_opt_state: optax.OptState | None = None
 
 
 class Roll(NamedTuple):
@@ -59,7 +61,8 @@ class DCAC:
     learning_rate: Annotated[float, "Adam's step size, for actor and critics together", (0.0, 1.0)] = 3e-4
     actor_share: Annotated[float, "weight w of the actor's loss; the critics' loss has 1 - w", (0.0, 1.0)] = 0.2
     reward_scale: Annotated[float, "factor on the rewards"] = 5.0
-    entropy_scale: Annotated[float, "fixed weight of the entropy"] = 1.0
+    temperature: Annotated[Literal["fixed", "learned"], "whether the entropy's weight is learned, as in SAC"] = "fixed"
+    entropy_scale: Annotated[float, "weight of the entropy, the initial one if it is learned"] = 1.0
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
     target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
     log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-20.0, 2.0)
@@ -87,8 +90,14 @@ class DCAC:
         size = input_size(spec, "augmented")
         actor = networks.mlp_init(actor_key, (size, *self.hidden, 2 * spec.action_size))
         critic = networks.twin_init(critic_key, (size, *self.hidden, 1))
-        opt_state = optax.adam(self.learning_rate).init((actor, critic))
-        return State(actor, critic, jax.tree.map(jnp.copy, critic), opt_state)
+        adam = optax.adam(self.learning_rate)
+        state = State(actor, critic, jax.tree.map(jnp.copy, critic), adam.init((actor, critic)))
+        if self.temperature == "fixed":
+            return state
+        if self.entropy_scale <= 0:
+            raise DelayRLError(f"a learned temperature starts above 0: entropy_scale must; got {self.entropy_scale}")
+        log_temperature = jnp.log(jnp.asarray(self.entropy_scale, jnp.float32))
+        return state._replace(log_temperature=log_temperature, temperature_opt_state=adam.init(log_temperature))
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
         """Return the actor's Gaussian at inputs `x`."""
@@ -104,23 +113,40 @@ class DCAC:
         return Deterministic("augmented", state.actor)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """Update actor and critics in one gradient step, then the target critics."""
+        """Update actor and critics in one gradient step, then the target critics and a learned temperature."""
         adam, params = optax.adam(self.learning_rate), (state.actor, state.critic)
-        batch = state.target, windows, key
+        temperature = self.entropy_scale if state.log_temperature is None else jnp.exp(state.log_temperature)
+        batch = state.target, windows, key, temperature
         (actor, critic), opt_state, _, metrics = descend(adam, self.loss, params, state.opt_state, *batch)
         target = optax.incremental_update(critic, state.target, self.target_rate)
-        return State(actor, critic, target, opt_state), metrics
+        state = state._replace(actor=actor, critic=critic, target=target, opt_state=opt_state)
+        if state.log_temperature is None:
+            return state, metrics
 
-    def loss(self, params: tuple[Params, Params], target: Params, windows: Window, key: Key) -> tuple[Array, Metrics]:
+        def loss(log_temperature: Array) -> tuple[Array, None]:
+            return temperature_loss(log_temperature, -metrics["entropy"], -windows.action.shape[-1]), None
+
+        log_temperature, opt_state, _, _ = descend(adam, loss, state.log_temperature, state.temperature_opt_state)
+        state = state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
+        return state, metrics | {"temperature": temperature}
+
+    def loss(
+        self,
+        params: tuple[Params, Params],
+        target: Params,
+        windows: Window,
+        key: Key,
+        temperature: Float[Array, ""] | float,
+    ) -> tuple[Array, Metrics]:
         """Return the weighted sum of the critics' squared error and the actor's negative soft value, and metrics."""
         actor, critic = params
         rolls = jax.vmap(self.roll, (None, 0, 0))(actor, windows, jax.random.split(key, windows.lead.shape[0]))
-        y = self.soft_return(rolls, self.reward_scale, values(target, rolls.x_last))
+        y = self.soft_return(rolls, self.reward_scale, temperature, values(target, rolls.x_last))
         value = values(critic, jax.lax.stop_gradient(rolls.x))
         critic_loss = ((value - jax.lax.stop_gradient(y)) ** 2).mean(-1).sum()
         # without the rewards of a stretch, which do not depend on its new actions
         frozen = jax.lax.stop_gradient(critic)
-        actor_loss = -self.soft_return(rolls, 0.0, values(frozen, rolls.x_last)).mean()
+        actor_loss = -self.soft_return(rolls, 0.0, temperature, values(frozen, rolls.x_last)).mean()
         metrics = {
             "critic_loss": critic_loss,
             "actor_loss": actor_loss,
@@ -130,9 +156,11 @@ class DCAC:
         }
         return self.actor_share * actor_loss + (1 - self.actor_share) * critic_loss, metrics
 
-    def soft_return(self, rolls: Roll, reward_scale: float, value: Float[Array, "2 batch"]) -> Float[Array, " batch"]:
+    def soft_return(
+        self, rolls: Roll, reward_scale: float, temperature: Float[Array, ""] | float, value: Float[Array, "2 batch"]
+    ) -> Float[Array, " batch"]:
         """Return Σ_{i<n} γ^i (reward - α log π) + γ^n (1 - ended) min_j V_j(x_n), with each sample's own n."""
-        reward = reward_scale * rolls.reward - self.entropy_scale * rolls.log_prob
+        reward = reward_scale * rolls.reward - temperature * rolls.log_prob
         return soft_target(
             k_step_return(reward, self.discount, rolls.steps), self.discount**rolls.steps, rolls.ended, value.min(0)
         )

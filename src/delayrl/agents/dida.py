@@ -12,7 +12,7 @@ Deviations from the paper and from the released code are numbered in docs/algori
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,8 @@ class DIDA:
     round_steps: Annotated[int, "environment steps in a round of aggregation, in which the student acts"] = 1000
     imitation_updates: Annotated[int, "student updates after each round, on fresh batches of all data"] = 1000
     student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)
-    student_learning_rate: Annotated[float, "RMSprop's step size", (0.0, 1.0)] = 1e-3
+    student_optimiser: Annotated[Literal["rmsprop", "adam"], "the student's optimiser"] = "rmsprop"
+    student_learning_rate: Annotated[float, "the student's step size", (0.0, 1.0)] = 1e-3
     student_decay: Annotated[float, "decay of RMSprop's mean of squared gradients", (0.0, 1.0)] = 0.9
     student_batch_size: Annotated[int, "windows per imitation batch"] = 32
 
@@ -93,7 +94,9 @@ class DIDA:
 
     @property
     def optimiser(self) -> optax.GradientTransformation:
-        """RMSprop as in PyTorch, with ε outside the root."""
+        """Adam, or RMSprop as in PyTorch, with ε outside the root."""
+        if self.student_optimiser == "adam":
+            return optax.adam(self.student_learning_rate)
         return optax.rmsprop(self.student_learning_rate, self.student_decay, eps=1e-10, eps_in_sqrt=False)
 
     def policy(self, student: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch action"]:

@@ -39,23 +39,64 @@ class Registration(NamedTuple):
         return protocols[name]
 
 
-_CLEARED = replace(OFFICIAL, last_starts="dropped")
-"""The protocol of released code that clears its n-step window at the end of an episode."""
+_VDPO = replace(
+    OFFICIAL,
+    start_states="same",
+    time_limit="terminates",
+    opening="one-random",
+    evaluation_opening="one-random",
+    last_starts="dropped",
+    capacity="entries",
+)
+"""VDPO's released code, and with it SAC, A-SAC and DIDA's expert, which it trains in the same way."""
+_BPQL = replace(OFFICIAL, opening="zeros", evaluation_opening="zeros", opening_steps="dropped")
+"""BPQL's released code, on which that of policy lifting is built."""
 _SMALL = Schedule(steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500)
 
 
-def _presets(paper: Agent, small: Agent, random_steps: int = 5_000) -> dict[str, Preset]:
-    """Return the paper's hyperparameters with its random steps, and small ones that train in minutes on a laptop."""
-    return {"paper": Preset(paper, Schedule(random_steps=random_steps)), "small": Preset(small, _SMALL)}
+_PAPER = Schedule()
+_MATCHED = Schedule(steps=100_000, random_steps=5_000, replay_capacity=200_000, evaluate_every=5_000)
+
+
+def _presets(paper: Agent, matched: Agent, small: Agent, schedule: Schedule = _PAPER) -> dict[str, Preset]:
+    """Return the paper's hyperparameters, the field's standard ones, and small ones that train in minutes."""
+    return {
+        "paper": Preset(paper, schedule),
+        "matched": Preset(matched, _MATCHED),
+        "small": Preset(small, _SMALL),
+    }
 
 
 def _soft(summary: str, paper: str, **sees: str) -> Registration:
     """Return the entry of SAC with the views `sees`, which are the only difference between these agents."""
-    agent = SAC(**sees)  # type: ignore[arg-type]
-    return Registration(summary, paper, _presets(agent, replace(agent, batch_size=128)))
+    agents = [replace(agent, **sees) for agent in (SAC(), _MATCHED_SAC, _SMALL_SAC)]  # type: ignore[arg-type]
+    return Registration(summary, paper, _presets(agents[0], agents[1], agents[2]), _VDPO)
 
 
-_SMALL_SAC = SAC(batch_size=128)
+_MATCHED_SAC = SAC(
+    critic_learning_rate=3e-4,
+    temperature_learning_rate=3e-4,
+    entropy_unit="scaled",
+    n_steps=1,
+    actor_every=1,
+    actor_updates=1,
+    log_std_range=(-20.0, 2.0),
+    log_std_bounds="clip",
+)
+"""SAC as the field's libraries have it: the preset `matched` builds every agent on it, with one update a step."""
+_MATCHED_BPQL = replace(_MATCHED_SAC, actor_sees="augmented")
+_MATCHED_ADSAC = replace(_MATCHED_BPQL, critic_sees="augmented", actor_updates=2)  # one for each of its two actors
+_MATCHED_VDPO = VDPO(_MATCHED_SAC, width=64, layers=2, dropout=0.0, clone_every=1, clone_updates=1)
+_MATCHED_DIDA = DIDA(
+    _MATCHED_SAC,
+    expert_steps=50_000,
+    student_hidden=(256, 256),
+    student_optimiser="adam",
+    student_learning_rate=3e-4,
+    student_batch_size=256,
+)
+_MATCHED_DCAC = DCAC(temperature="learned", reward_scale=1.0, batch_size=256)
+_SMALL_SAC = SAC(batch_size=128, entropy_unit="scaled")
 _SMALL_BPQL = replace(_SMALL_SAC, actor_sees="augmented")
 _SMALL_VDPO = VDPO(_SMALL_SAC, width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250)
 _SMALL_DIDA = DIDA(_SMALL_SAC, expert_steps=10_000, round_steps=250, imitation_updates=250)
@@ -64,34 +105,49 @@ AGENTS: dict[str, Registration] = {
     "vdpo": Registration(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
-        _presets(VDPO(), _SMALL_VDPO),
-        _CLEARED,
+        _presets(VDPO(), _MATCHED_VDPO, _SMALL_VDPO),
+        replace(_VDPO, opening="agent", overrides={**OFFICIAL.overrides, "at_age_0": "random"}),
     ),
     "lifting": Registration(
         "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
         "Lee et al., 2026, arXiv 2604.03641",
-        _presets(Lifting(), Lifting(_SMALL_BPQL, lifting_hold=3_750, lifting_end=11_250), random_steps=10_000),
+        _presets(
+            Lifting(),
+            Lifting(_MATCHED_BPQL, lifting_hold=25_000, lifting_end=75_000),
+            Lifting(_SMALL_BPQL, lifting_hold=3_750, lifting_end=11_250),
+            Schedule(random_steps=10_000, update_after=100),
+        ),
+        _BPQL,
     ),
     "ad-sac": Registration(
         "learns values for a shorter delay, and improves the actor of the long one by them",
         "Wu et al., ICML 2024",
-        _presets(ADSAC(), ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))),
-        replace(_CLEARED, overrides={"evaluation": "sample"}),
+        _presets(ADSAC(), ADSAC(_MATCHED_ADSAC), ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))),
+        replace(
+            _VDPO,
+            start_states="own",
+            opening="agent",
+            evaluation_opening="agent",
+            overrides={**OFFICIAL.overrides, "evaluation": "sample"},
+        ),
     ),
     "dida": Registration(
         "a student on x_t imitates a delay-free SAC expert (DAgger); the expert's steps are counted",
         "Liotet et al., ICML 2022",
-        _presets(DIDA(), _SMALL_DIDA),
+        _presets(DIDA(), _MATCHED_DIDA, _SMALL_DIDA),
+        replace(_VDPO, start_states="own", opening="random", evaluation_opening="random"),
     ),
     "dcac": Registration(
         "learns values on past stretches whose actions are sampled again inside the augmented state",
         "Bouteiller, Ramstedt et al., ICLR 2021",
-        _presets(DCAC(), DCAC(), random_steps=10_000),
+        _presets(DCAC(), _MATCHED_DCAC, DCAC(), Schedule(random_steps=10_000)),
+        replace(OFFICIAL, time_limit="dropped"),
     ),
     "bpql": Registration(
         "SAC whose actor sees x_t and whose critic sees s_t",
         "Kim et al., NeurIPS 2023",
-        _presets(BPQL, _SMALL_BPQL, random_steps=10_000),
+        _presets(BPQL, _MATCHED_BPQL, _SMALL_BPQL, Schedule(random_steps=10_000, update_after=1_000)),
+        _BPQL,
     ),
     "a-sac": _soft(
         "SAC on the augmented state x_t = (last observation, actions since)",
@@ -106,7 +162,7 @@ AGENTS: dict[str, Registration] = {
         critic_sees="delayed",
     ),
     "sac": _soft("the delay-free reference: trains with --delay 0", "Haarnoja et al., ICML 2018"),
-    "random": Registration("uniform actions", "-", _presets(Random(), Random())),
+    "random": Registration("uniform actions", "-", _presets(Random(), Random(), Random()), _VDPO),
 }
 
 

@@ -16,7 +16,7 @@ Deviations are numbered in docs/algorithms/sac.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,7 @@ class State(NamedTuple):
     temperature_opt_state: optax.OptState
 
 
+EntropyUnit = Literal["scaled", "task"]
 Penalty = Callable[[Gaussian], Array]
 """A term that agents built on SAC add to the actor's loss: a function of its policy on the batch."""
 
@@ -65,6 +66,7 @@ class SAC:
     temperature_learning_rate: Annotated[float, "Adam's step size for the temperature", (0.0, 1.0)] = 1e-3
     initial_temperature: Annotated[float, "initial weight of the entropy", (1e-6, 1e6)] = 1.0
     entropy_per_action: Annotated[float, "target entropy per action dimension"] = -1.0
+    entropy_unit: Annotated[EntropyUnit, "unit of actions for entropies: scaled to [-1, 1], or the task's"] = "task"
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
     target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
     n_steps: Annotated[int, "longest k of the k-step targets; k is drawn from 1..n_steps"] = 3
@@ -133,10 +135,10 @@ class SAC:
         target_key, actor_key = jax.random.split(key)
         actor_now, critic_now = self._inputs(windows, 0)
         actor_next, critic_next = self._inputs(windows, windows.n_step)
-        action_size = windows.action.shape[-1]
 
         temperature = jnp.exp(state.log_temperature)
         action, log_prob = networks.sample(self.policy(state.actor, actor_next), target_key)
+        log_prob -= self.log_scale(windows)
         next_value = soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature)
         state, metrics = self.learn_critic(state, windows, critic_now, next_value)
 
@@ -144,7 +146,7 @@ class SAC:
             for update_key in jax.random.split(actor_key, self.actor_updates):
                 policy_key, temperature_key = jax.random.split(update_key)
                 state = self.improve_actor(state, actor_now, critic_now, policy_key, penalty)
-                state = self.adjust_temperature(state, actor_now, action_size, temperature_key)
+                state = self.adjust_temperature(state, actor_now, self.target_entropy(windows), temperature_key)
             return state
 
         state = jax.lax.cond(count % self.actor_every == self.actor_every - 1, improve, lambda state: state, state)
@@ -183,9 +185,16 @@ class SAC:
         actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)
         return state._replace(actor=actor, actor_opt_state=opt_state)
 
-    def adjust_temperature(self, state: State, actor_input: Array, action_size: int, key: Key) -> State:
+    def log_scale(self, windows: Window) -> float:
+        """Return by how much a log-density over actions in [-1, 1] exceeds that in the agent's unit of entropies."""
+        return windows.log_scale if self.entropy_unit == "task" else 0.0
+
+    def target_entropy(self, windows: Window) -> float:
+        """Return the target entropy of actions scaled to [-1, 1]: -A (SAC), less where -A is meant in task units."""
+        return self.entropy_per_action * windows.action.shape[-1] - self.log_scale(windows)
+
+    def adjust_temperature(self, state: State, actor_input: Array, target_entropy: float, key: Key) -> State:
         """Take one gradient step on the temperature towards the target entropy, with a fresh sample of the policy."""
-        target_entropy = self.entropy_per_action * action_size
         _, log_prob = networks.sample(self.policy(state.actor, actor_input), key)
 
         def loss(log_temperature: Array) -> tuple[Array, None]:

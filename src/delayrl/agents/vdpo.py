@@ -30,6 +30,7 @@ from delayrl.errors import DelayRLError
 Representation = Literal["transformer", "transformer-no-belief", "mlp"]
 Behaviour = Literal["lower-q", "delayed", "reference", "mixture"]
 Direction = Literal["reverse", "forward"]
+Current = Literal["reference", "random"]
 
 
 class State(NamedTuple):
@@ -69,6 +70,7 @@ class VDPO:
         Behaviour,
         "who acts in training: delayed, reference, mixture (a coin flip), or lower-q (the one with the lower Q)",
     ] = "lower-q"
+    at_age_0: Annotated[Current, "the delayed policy's action in training where nothing is hidden"] = "reference"
 
     @property
     def privileged(self) -> bool:
@@ -124,6 +126,9 @@ class VDPO:
         if not explore:
             return networks.mode(policy)
         delayed, _ = networks.sample(policy, delayed_key)
+        if self.at_age_0 == "random":
+            anything = networks.uniform(jax.random.fold_in(delayed_key, 1), delayed.shape)
+            delayed = jnp.where(seen.age > 0, delayed, anything)
         if self.behaviour == "delayed":
             return delayed
         truth = seen.truth

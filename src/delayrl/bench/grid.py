@@ -180,7 +180,7 @@ def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str,
     """Resolve a condition. Raises DelayRLError if it cannot be trained."""
     setup = resolve(agent, env, delay, preset, protocol, json.loads(overrides))
     task = make(env, setup.delay.observed())
-    check_fit(setup.agent, setup.schedule, task)
+    check_fit(setup, task)
     task.close()
     return setup
 

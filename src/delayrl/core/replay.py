@@ -46,18 +46,28 @@ def init(spec: Spec, capacity: int) -> Replay:
     )
 
 
-def append(replay: Replay, step: Transition, min_episode_steps: int = 1) -> Replay:
-    """Store one step in its row, and the next observation in the next row, which the following step completes.
+class Learnable(NamedTuple):
+    """Which steps of an episode can be sampled: all by default. All steps are stored."""
 
-    A step can be sampled once its episode has `min_episode_steps` steps from it on. The last `min_episode_steps` - 1
-    never can, as in released code that clears its n-step window at the end of an episode.
-    """
+    first: int = 0  # those before this one cannot
+    until_end: int = 1  # nor can those from which on the episode has fewer steps, which released code never stores
+    time_limit: bool = True  # nor, if false, the step that a time limit ends
+
+
+ALL = Learnable()
+
+
+def append(replay: Replay, step: Transition, learnable: Learnable = ALL) -> Replay:
+    """Store one step in its row, and the next observation in the next row, which the following step completes."""
     capacity = replay.obs.shape[0]
     here, after = replay.rows % capacity, (replay.rows + 1) % capacity
     rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps the row of its last observation
     moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before the write, or XLA copies the array
-    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (min_episode_steps - 1))
-    steps, lost = replay.steps + (moment >= min_episode_steps), replay.lost
+    row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (learnable.until_end - 1))
+    counts = moment >= learnable.first + learnable.until_end
+    if not learnable.time_limit:
+        counts &= step.terminated | ~step.done
+    steps, lost = replay.steps + counts, replay.lost
     for _ in range(2):  # a step overwrites at most two rows
         lost += ((lost < steps) & (row_of[lost % capacity] <= rows - capacity)).astype(jnp.int32)
     return Replay(
@@ -74,7 +84,9 @@ def append(replay: Replay, step: Transition, min_episode_steps: int = 1) -> Repl
     )
 
 
-def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden: Int[Array, ""]) -> Window:
+def sample(
+    replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden: Int[Array, ""], log_scale: float = 0.0
+) -> Window:
     """Sample windows around uniformly drawn steps. No window crosses the boundary of an episode.
 
     Args:
@@ -84,6 +96,7 @@ def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden:
         delay: Δ, the number of rows before the step.
         ahead: number of rows after the step, which is the longest k of a k-step target.
         hidden: number of newest observations that have not arrived yet: the learner's age, 0 if it may see them all.
+        log_scale: of the task's actions, which the windows carry.
 
     Returns:
         Windows with a leading axis `batch`.
@@ -116,4 +129,5 @@ def sample(replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden:
         lead=lead,
         n_step=jnp.minimum(drawn, lead),
         delay=delay,
+        log_scale=log_scale,
     )

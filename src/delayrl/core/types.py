@@ -17,11 +17,12 @@ Action = Float[Array, " action"]
 
 @dataclass(frozen=True)
 class Spec:
-    """The task as an agent needs it: its sizes, and the longest age Δ of an observation, in steps."""
+    """The task as an agent needs it: its sizes, the longest age Δ of an observation in steps, the actions' range."""
 
     obs_size: int
     action_size: int
     delay: int
+    log_scale: float = 0.0  # Σ log of the half ranges of the task's actions: see `Window`
 
 
 class Seen(NamedTuple):
@@ -61,6 +62,7 @@ class Window:
 
     Rows that lie outside the episode, or have not arrived yet, are zero and not `valid`. `lead` counts the valid rows
     after t. `n_step` is the length k of this sample's k-step target, drawn from 1..ahead and limited to `lead`.
+    A log-density over the scaled actions, less `log_scale`, is one over actions in the task's units.
     """
 
     obs: Float[Array, "time obs"]
@@ -72,3 +74,4 @@ class Window:
     lead: Int[Array, ""]
     n_step: Int[Array, ""]
     delay: int = field(metadata={"static": True})
+    log_scale: float = field(default=0.0, metadata={"static": True})

@@ -56,12 +56,12 @@ class Evaluator:
         states: State,
         reset_seeds: Sequence[Sequence[int]],
         keys: Key,
-        first: NDArray[np.float32] | None = None,
+        opening: NDArray[np.float32] | None = None,
         travel_seeds: Sequence[Sequence[int]] | None = None,
     ) -> Episodes:
         """Play one episode from each reset seed, [seeds, episodes].
 
-        `first` are the first actions, [seeds, episodes, A], if they are not the policy's; `travel_seeds` the seeds of
+        `opening` are first actions that are not the policy's, [seeds, episodes, steps, A]; `travel_seeds` the seeds of
         the travel times, if they are not those of the start states. Raises DelayRLError for what is not finite.
         """
         shape = (len(self._envs), len(self._envs[0]))
@@ -77,7 +77,7 @@ class Evaluator:
         while running.any():
             batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
             actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
-            actions = first if step == 0 and first is not None else actions
+            actions = opening[:, :, step] if opening is not None and step < opening.shape[2] else actions
             step += 1
             alive = [(int(i), int(j)) for i, j in np.argwhere(running)]
             played = self._apply(self._step, alive, [actions[at] for at in alive])

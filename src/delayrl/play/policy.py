@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from gymnasium.wrappers import RescaleAction
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State, template
@@ -81,5 +82,8 @@ def restored(config: dict[str, Any], checkpoint: Checkpoint) -> Policy:
 
 
 def spec_of(env: Any) -> Spec:
-    """Return the sizes and the longest age of a wrapped task."""
-    return Spec(env.observation_space.shape[0], env.action_space.shape[0], env.history)
+    """Return the sizes, the longest age and the actions' range of a wrapped task."""
+    task = env.env.env if isinstance(env.env, RescaleAction) else env.env
+    actions: Any = task.action_space
+    half_range = (actions.high.astype(float) - actions.low) / 2
+    return Spec(env.observation_space.shape[0], env.action_space.shape[0], env.history, float(np.log(half_range).sum()))

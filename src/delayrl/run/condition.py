@@ -8,12 +8,13 @@ from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.registry import find_agent
-from delayrl.core.protocol import Protocol
+from delayrl.core.protocol import Protocol, opening_length
+from delayrl.core.replay import Learnable
 from delayrl.core.types import Spec
 from delayrl.delays import Delay, DelayLike, as_delay, short_label
 from delayrl.envs import delay_of
 from delayrl.errors import DelayRLError
-from delayrl.run.configuration import check_names, override, values_of
+from delayrl.run.configuration import OLDER, check_names, override, values_of
 from delayrl.run.rows import CONDITION
 
 KINDS = CONDITION | {"overrides": dict, "steps": int}
@@ -73,11 +74,22 @@ class Setup:
         """The configuration that a run folder keeps: every option by name, defaults included."""
         names = {name: getattr(self.condition, name) for name in ("agent", "preset", "env", "delay", "protocol")}
         options = {"hyperparameters": values_of(self.agent), "schedule": values_of(self.schedule)}
-        return names | {"privileged": self.agent.privileged} | options
+        rules = {f.name: value for f in fields(Protocol) if (value := getattr(self.protocol, f.name)) != f.default}
+        habits = {name: value for name, value in rules.items() if name not in ("name", "overrides")}
+        return names | {"privileged": self.agent.privileged} | options | ({"habits": habits} if habits else {})
 
-    def min_episode_steps(self, spec: Spec) -> int:
-        """Return how many steps of an episode must be stored, from a step on, before that step can be sampled."""
-        return self.agent.ahead(spec) if self.protocol.last_starts == "dropped" else 1
+    def learnable(self, spec: Spec) -> Learnable:
+        """Return which steps of an episode can be sampled under the protocol."""
+        rules = self.protocol
+        return Learnable(
+            first=opening_length(rules.opening, spec.delay) if rules.opening_steps == "dropped" else 0,
+            until_end=self.agent.ahead(spec) if rules.last_starts == "dropped" else 1,
+            time_limit=rules.time_limit != "dropped",
+        )
+
+    def entries(self, spec: Spec) -> int:
+        """Return how many units of `replay_capacity` a row of the replay takes under the protocol."""
+        return self.agent.ahead(spec) if self.protocol.capacity == "entries" else 1
 
     def cell_id(self, seeds: Sequence[int]) -> str:
         """Return the name of a group of seeds: a hash of the configuration, however the user wrote it."""
@@ -85,13 +97,16 @@ class Setup:
 
     @property
     def configuration(self) -> str:
-        """Return a hash of all options. Rows name it: with their other columns it says what was trained, but the seed."""
+        """Return a hash of all options. With their other columns, it tells rows what was trained, but for the seed."""
         return _digest({name: self._decisive[name] for name in ("hyperparameters", "schedule")})
 
     @property
     def _decisive(self) -> dict[str, Any]:
-        """The part of the configuration that ids are made of."""
-        return {name: value for name, value in self.config.items() if name != "privileged"}
+        """The part of the configuration that ids are made of: the same as before an option was added."""
+        config = {name: value for name, value in self.config.items() if name != "privileged"}
+        for name in ("hyperparameters", "schedule"):
+            config[name] = {key: x for key, x in config[name].items() if key not in OLDER or x != OLDER[key]}
+        return config
 
 
 def _digest(parts: Mapping[str, Any]) -> str:
@@ -124,4 +139,4 @@ def agent_of(config: Mapping[str, Any]) -> Agent:
     except (KeyError, DelayRLError) as error:
         raise DelayRLError(f"the run's configuration names an unknown agent or preset: {error}") from error
     check_names(config["hyperparameters"], agent)
-    return override(agent, config["hyperparameters"])  # type: ignore[no-any-return]
+    return override(agent, {**OLDER, **config["hyperparameters"]})  # type: ignore[no-any-return]

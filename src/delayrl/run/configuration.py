@@ -8,6 +8,15 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from delayrl.errors import DelayRLError
 
+OLDER: Mapping[str, Any] = {
+    "entropy_unit": "scaled",
+    "at_age_0": "reference",
+    "student_optimiser": "rmsprop",
+    "temperature": "fixed",
+    "update_after": 0,
+}
+"""Options that were added later, with what an older configuration means that does not mention them."""
+
 
 @dataclass(frozen=True)
 class Option:

@@ -38,7 +38,7 @@ def _seconds(group: Group, state: TrainState) -> float:
     for phase in group.program.phases:
         cost = jax.jit(phase.update).lower(*update_shapes(phase, group.setup.agent, group.spec)).cost_analysis()
         flops = float((cost or {}).get("flops", 0.0))
-        rounds = (schedule.steps - max(state.step, schedule.random_steps)) / phase.every
+        rounds = (schedule.steps - max(state.step, schedule.first_update)) / phase.every
         seconds += max(rounds, 0) * phase.updates * len(group.seeds) * (flops / (UTILISATION * rate) + 3e-4)
     return seconds
 

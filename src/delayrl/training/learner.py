@@ -38,9 +38,9 @@ class Program:
     Get one from `compiled`: it returns the same functions for the same agent and task.
     """
 
-    def __init__(self, agent: Agent, spec: Spec, min_episode_steps: int = 1) -> None:
+    def __init__(self, agent: Agent, spec: Spec, learnable: ring.Learnable = ring.ALL) -> None:
         self.phases, self._agent, self._spec = agent.phases(), agent, spec
-        self._append = functools.partial(ring.append, min_episode_steps=min_episode_steps)
+        self._append = functools.partial(ring.append, learnable=learnable)
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="first_phase", donate_argnums=0)
         self._jitted_update = jax.jit(self._update, static_argnames="index", donate_argnums=0)
@@ -56,16 +56,16 @@ class Program:
         return self._jitted_act(agent, seen, keys, np.int32(step))
 
     def learn(
-        self, learner: Learner, pending: list[list[Stored]], keys: Key, last: int, random_steps: int
+        self, learner: Learner, pending: list[list[Stored]], keys: Key, last: int, first_update: int
     ) -> tuple[Learner, Metrics, bool]:
         """Store the newest steps and run the phases that are due at them, without waiting. Donates `learner`.
 
-        `pending` are steps, [steps][seeds], up to number `last`. Nothing is due before `random_steps`. If the first
+        `pending` are steps, [steps][seeds], up to number `last`. Nothing is due before `first_update`. If the first
         phase is due at every step, it runs after each is stored; all others run at the end. Returns the new learner,
         its metrics, and whether anything was due.
         """
         steps = range(last - len(pending) + 1, last + 1)
-        due = [self._due(step) if step >= random_steps else [] for step in steps]
+        due = [self._due(step) if step >= first_update else [] for step in steps]
         first_phase = all(0 in phases for phases in due)
         flat = [stored for seeds in pending for stored in seeds]
         shape = (len(steps), len(pending[0]))
@@ -107,6 +107,7 @@ class Program:
         agent, replay = learner
         phase = self.phases[index]
         reach = (phase.batch, self._spec.delay, self._agent.ahead(self._spec))
+        log_scale = self._spec.log_scale
 
         def update(agent: State, i: Int[Array, ""]) -> tuple[State, Metrics]:
             count = step // phase.every * phase.updates + i
@@ -117,7 +118,8 @@ class Program:
                 for number in (step, index, i):
                     key = jax.random.fold_in(key, number)
                 sample_key, update_key = jax.random.split(key)
-                return phase.update(agent, ring.sample(replay, sample_key, *reach, hidden), update_key, count)
+                windows = ring.sample(replay, sample_key, *reach, hidden, log_scale)
+                return phase.update(agent, windows, update_key, count)
 
             return jax.vmap(update_seed)(agent, replay, keys, jnp.asarray(hidden))
 

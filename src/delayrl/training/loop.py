@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from delayrl.core.protocol import opening_length
 from delayrl.core.types import Metrics
 from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, StoppedError
@@ -100,33 +101,46 @@ class Loop:
         """Return the next actions, chosen by what was learned until now. Does not wait for them."""
         state, group = self.state, self.group
         if state.actions is None:
-            state.actions = self._random_actions() if state.step < group.setup.schedule.random_steps else self._act()
+            random = state.step < group.setup.schedule.random_steps
+            state.actions = self._opened(self._random_actions() if random else self._act())
         return state.actions
 
     def learn(self) -> None:
         """Give the newest steps to the learner, which learns what is due. Does not wait for it."""
-        group, state = self.group, self.state
+        group, state, schedule = self.group, self.state, self.group.setup.schedule
         if not state.pending:
             return
+        first = schedule.first_update
+        if not self._learning and first <= state.step < schedule.random_steps and not self._can_learn():
+            first = state.step + 1  # there is still time
         state.learner, metrics, learned = group.program.learn(
-            state.learner, state.pending, group.keys, state.step, group.setup.schedule.random_steps
+            state.learner, state.pending, group.keys, state.step, first
         )
         state.pending = []
         self._metrics |= metrics
         if learned and not self._learning:
             self._learning = True
-            if int(state.learner.replay.steps.min()) < group.spec.delay + 1:  # the first block's own steps count too
+            if not self._can_learn():  # the first block's own steps count too
                 env = group.setup.condition.env
                 raise DelayRLError(f"no episode of {env} is long enough to learn from under this protocol")
 
     def _act(self) -> Any:
         group, state = self.group, self.state
         seen = jax.tree.map(lambda *x: np.stack(x), *[actor.seen for actor in state.actors])
-        actions = group.program.act(state.learner.agent, seen, group.keys, state.step)
-        if group.setup.protocol.first_action == "random" and group.spec.delay:
-            first = np.array([[not actor.actions] for actor in state.actors])
-            return np.where(first, self._random_actions(), actions)
-        return actions
+        return group.program.act(state.learner.agent, seen, group.keys, state.step)
+
+    def _opened(self, actions: Any) -> Any:
+        """Return the actions, but those of the protocol in episodes that open."""
+        opening = self.group.setup.protocol.opening
+        length = opening_length(opening, self.group.spec.delay)
+        if not length:
+            return actions
+        opens = np.array([[len(actor.actions) < length] for actor in self.state.actors])
+        return np.where(opens, np.float32(0) if opening == "zeros" else self._random_actions(), actions)
+
+    def _can_learn(self) -> bool:
+        """Whether every seed has steps to learn from, even while its newest Δ are hidden."""
+        return int(self.state.learner.replay.steps.min()) > self.group.spec.delay
 
     def _random_actions(self) -> NDArray[np.float32]:
         generators = [np.random.default_rng([seed, RANDOM_ACTIONS, self.state.step]) for seed in self.group.seeds]

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from delayrl.agents.base import State
+from delayrl.core.protocol import opening_length
 from delayrl.core.types import Metrics, Spec
 from delayrl.envs import physics
 from delayrl.errors import DelayRLError
@@ -43,14 +44,14 @@ class Recorder:
         episodes = range(group.setup.schedule.evaluation_episodes)
         own = [[reset_seed(seed, EVALUATION, step, episode) for episode in episodes] for seed in group.seeds]
         resets = [[seed] * len(episodes) for seed in group.seeds] if protocol.start_states == "same" else own
-        first = None
-        if protocol.first_action == "random" and group.spec.delay:
-            size = group.spec.action_size
-            first = np.array([[np.random.default_rng(n).uniform(-1, 1, size) for n in row] for row in own], np.float32)
+        shape = (opening_length(protocol.evaluation_opening, group.spec.delay), group.spec.action_size)
+        bound = 0 if protocol.evaluation_opening == "zeros" else 1
+        opens = [[np.random.default_rng(n).uniform(-bound, bound, shape) for n in row] for row in own]
+        opening = np.array(opens, np.float32)
         keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(group.keys)
         summary = []
         for policy, evaluator in self._evaluators.items():
-            played = evaluator(states[policy], resets, keys, first if policy == "agent" else None, own)
+            played = evaluator(states[policy], resets, keys, opening if policy == "agent" else None, own)
             summary.append(f"{policy} {played.returns.mean():.4g}")
             for i, (run, tracker) in enumerate(zip(group.runs, self._trackers, strict=True)):
                 rows = [

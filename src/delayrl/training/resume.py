@@ -14,7 +14,7 @@ from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, flatten_tree, load_arrays, restore_tree
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.configuration import values_of
+from delayrl.run.configuration import OLDER, values_of
 from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
@@ -49,7 +49,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
         if not run.exists:
             cost = cost_of(group.setup.agent, group.spec, group.setup.schedule)
             run.create(config | {"seed": seed, "cost": cost.json})
-    learner = group.program.init(group.keys, group.setup.schedule.replay_capacity)
+    learner = group.program.init(group.keys, group.replay_rows)
     state = TrainState(0, learner, actors, [], None, [{} for _ in runs], [(0, 0) for _ in runs])
     if not checkpoints:
         for run in runs:
@@ -86,10 +86,9 @@ def _common_checkpoints(runs: list[Run], note: Callable[[str], None]) -> list[Ch
 def _check_same(run: Run, wanted: dict[str, Any]) -> None:
     """Raise DelayRLError if a folder holds a run with another configuration."""
     stored = run.config
-    added_later = values_of(Schedule())  # options that an older configuration does not mention had these values
     for key, value in wanted.items():
         if isinstance(value, dict):
-            known = added_later | stored[key] if key == "schedule" else stored[key]
+            known = {**values_of(Schedule()), **OLDER, **stored.get(key, {})}
             changed = [name for name in value if known.get(name) != value[name]]
         else:
             changed = [key] if stored.get(key) != value else []
@@ -153,7 +152,7 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
         if complete:
             run.save(state.step, weights, None, {}, complete=True)
             continue
-        own, until = _save_replay(run, state, i, group.setup.schedule.replay_capacity)
+        own, until = _save_replay(run, state, i, group.replay_rows)
         run.save(state.step, weights, _loop_arrays(group, state, i), own)
         run.drop_pieces()
         pieces.append(own)

@@ -26,6 +26,7 @@ class Group:
     spec: Spec
     template: State  # shapes and types of the agent's state
     program: Program
+    replay_rows: int
     apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other
 
 

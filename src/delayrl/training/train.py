@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 from tqdm import tqdm
 
-from delayrl.agents.base import PRODUCTS, Agent, Schedule, State, template
+from delayrl.agents.base import PRODUCTS, State, template
 from delayrl.delays import DelayLike
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
-from delayrl.run.condition import Condition, resolve
+from delayrl.run.condition import Condition, Setup, resolve
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers
@@ -81,7 +81,7 @@ def train(
     observed = setup.delay.observed()
     envs = [make(env, observed, rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
-    shapes = check_fit(setup.agent, setup.schedule, envs[0])  # before anything is stored
+    shapes = check_fit(setup, envs[0])  # before anything is stored
     if device != "gpu":
         keep_buffers(setup.agent, spec, seeds)  # before JAX looks for its devices
     precision = PRODUCTS[setup.schedule.precision]
@@ -89,8 +89,9 @@ def train(
         privileged, rules = setup.agent.privileged, setup.protocol
         actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
-        program = compiled(setup.agent, spec, setup.min_episode_steps(spec))
-        group = Group(setup, numbers, runs, keys, spec, shapes, program, pool.map if threads > 1 else map)
+        program = compiled(setup.agent, spec, setup.learnable(spec))
+        rows = setup.schedule.replay_capacity // setup.entries(spec)
+        group = Group(setup, numbers, runs, keys, spec, shapes, program, rows, pool.map if threads > 1 else map)
 
         def note(line: str) -> None:
             if progress:
@@ -112,13 +113,13 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
     return [Run(home / f"seed{seed}") for seed in seeds]
 
 
-def check_fit(agent: Agent, schedule: Schedule, env: Delayed) -> State:
+def check_fit(setup: Setup, env: Delayed) -> State:
     """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
-    spec, task = spec_of(env), env.spec
+    agent, schedule, spec, task = setup.agent, setup.schedule, spec_of(env), env.spec
     least = 2 * (spec.delay + agent.ahead(spec)) + 2
-    for name in ("replay_capacity", "random_steps"):
-        if getattr(schedule, name) < least:
-            raise DelayRLError(f"{name} must be at least {least} here; got {getattr(schedule, name)}")
+    for name, units in (("replay_capacity", setup.entries(spec)), ("random_steps", 1), ("update_after", 1)):
+        if getattr(schedule, name) < least * units and (name, schedule.update_after) != ("update_after", 0):
+            raise DelayRLError(f"{name} must be at least {least * units} here; got {getattr(schedule, name)}")
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
