@@ -1,9 +1,10 @@
 """Draw the pictures of docs/theory.md and print every number that it quotes.
 
-Usage: python benchmarks/theory_figure.py [folder for the pictures]. Takes about a minute on one core.
+Usage: python benchmarks/theory_figure.py [folder for the pictures]. Takes about ten minutes on one core.
 """
 
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "agents"))  # the exact solvers are shared with the tests
 
+import fixed_points as fix  # noqa: E402
+import gaussians  # noqa: E402
 import tabular as tab  # noqa: E402
+import trajectories  # noqa: E402
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt  # noqa: E402
@@ -91,11 +95,11 @@ def latching(axes: Any) -> None:
     heading("Tracking, temperature 0.1, delays 0, 1, 2, 3")
     mdp, temperature, delays = tab.tracking(), 0.1, range(4)
 
-    def returns(data: tab.Data, forward: bool) -> list[float]:
+    def returns(data: fix.Data, forward: bool) -> list[float]:
         return [
             tab.policy_return(
                 tab.augment(mdp, delay).mdp,
-                tab.imitation_fixed_point(mdp, delay, temperature, data=data, forward=forward),
+                fix.imitation_fixed_point(mdp, delay, temperature, data=data, forward=forward),
             )
             for delay in delays
         ]
@@ -112,8 +116,10 @@ def latching(axes: Any) -> None:
     row("best delayed policy", best)
     for label, values in curves.items():
         row(label, values)
-    bpql = [tab.bpql_fixed_point(mdp, delay, temperature)[1] for delay in delays]
-    row("BPQL", [tab.policy_return(tab.augment(mdp, d).mdp, p) for d, p in zip(delays, bpql, strict=True)])
+    bpql = [fix.bpql_fixed_point(mdp, delay, temperature).policy for delay in delays]
+    adsac = [fix.adsac_fixed_point(mdp, delay, temperature, data="lower_q").policy for delay in delays]
+    for label, policies in (("BPQL", bpql), ("AD-SAC, argmin data", adsac)):
+        row(label, [tab.policy_return(tab.augment(mdp, d).mdp, p) for d, p in zip(delays, policies, strict=True)])
     axes.plot(delays, best, color=GREY, lw=4, alpha=0.45, label="best delayed policy")
     axes.plot(delays, curves["reverse, own data"], color=BLUE, marker="o", ms=4, label="reverse KL, own data")
     axes.plot(
@@ -175,9 +181,9 @@ def trajectory_numbers() -> None:
         reference = rng.dirichlet(np.ones(2), size=3)
         delayed = tab.augment(mdp, delay)
         policy = rng.dirichlet(np.ones(2), size=len(delayed.histories))
-        divergences.append(tab.trajectory_kl(mdp, delay, reference, policy))
+        divergences.append(trajectories.trajectory_kl(mdp, delay, reference, policy))
         by_belief = tab.mixture(delayed.belief, reference)
-        gaps.append(tab.trajectory_kl(mdp, delay, reference, by_belief))
+        gaps.append(trajectories.trajectory_kl(mdp, delay, reference, by_belief))
     row("KL of the trajectories", [d.trajectory for d in divergences], 4)
     row("sum, (s_t, x_t) jointly from π", [d.joint for d in divergences], 4)
     row("sum, s_t from the belief", [d.belief for d in divergences], 4)
@@ -197,7 +203,7 @@ def trajectory_numbers() -> None:
     divergences = []
     for delay in range(4):
         belief_mixture = tab.mixture(tab.augment(mdp, delay).belief, reference)
-        divergences.append(tab.trajectory_kl(mdp, delay, reference, belief_mixture, horizon=6))
+        divergences.append(trajectories.trajectory_kl(mdp, delay, reference, belief_mixture, horizon=6))
     row("tracking, 6 steps: KL of Eq. (7)", [d.trajectory for d in divergences], 4)
     row("... above the least possible", [d.minimiser_excess for d in divergences], 4)
     print(f"tracking, Δ = 1: every step after the first adds {rate:.4f} to the KL of the best π_Δ")
@@ -216,8 +222,8 @@ def gaussian_panel(axes: Any) -> None:
         shape: Array = np.exp(-((grid - centre) ** 2) / (2 * spread)) / np.sqrt(2 * np.pi * spread)
         return shape
 
-    forward = [float(part[0]) for part in tab.moment_match(weight, mean, variance)]
-    reverse = [float(part[0]) for part in tab.precision_weighted(weight, mean, variance)]
+    forward = [float(part[0]) for part in gaussians.moment_match(weight, mean, variance)]
+    reverse = [float(part[0]) for part in gaussians.precision_weighted(weight, mean, variance)]
     for label, (centre, spread) in (("forward", forward), ("reverse", reverse)):
         print(f"{label}: mean {centre:.4f}, variance {spread:.4f}, deviation {np.sqrt(spread):.4f}")
     mixed = sum(w * density(m[0], v[0]) for w, m, v in zip(weight, mean, variance, strict=True))
@@ -262,6 +268,7 @@ def game_panel(axes: Any) -> None:
         "mixture": [],
         "geometric mean": [],
         "BPQL": [],
+        "AD-SAC": [],
         "best delayed policy": [],
     }
     for cost in costs:
@@ -271,7 +278,8 @@ def game_panel(axes: Any) -> None:
         policies = {
             "mixture": tab.mixture(delayed.belief, reference),
             "geometric mean": tab.geometric_mean(delayed.belief, reference),
-            "BPQL": tab.bpql_fixed_point(mdp, 1, 0.02)[1],
+            "BPQL": fix.bpql_fixed_point(mdp, 1, 0.02).policy,
+            "AD-SAC": fix.adsac_fixed_point(mdp, 1, 0.02).policy,
             "best delayed policy": tab.optimal_policy(delayed.mdp),
         }
         for label, policy in policies.items():
@@ -297,12 +305,13 @@ def fixed_point_numbers() -> None:
     _, reference = tab.soft_optimal(mdp, temperature)
     policies = {
         "Eq. (7)": tab.mixture(delayed.belief, reference),
-        "DIDA, log loss": tab.imitation_fixed_point(mdp, 2, temperature, data="delayed", forward=True),
-        "Eq. (6)": tab.imitation_fixed_point(mdp, 2, temperature, data="reference", forward=True),
+        "DIDA, log loss": fix.imitation_fixed_point(mdp, 2, temperature, data="delayed", forward=True),
+        "Eq. (6)": fix.imitation_fixed_point(mdp, 2, temperature, data="reference", forward=True),
         "Eq. (11)": tab.geometric_mean(delayed.belief, reference),
-        "AD-SAC 0": improved(mdp, 2, 0, temperature),
-        "AD-SAC 1": improved(mdp, 2, 1, temperature),
-        "BPQL": tab.bpql_fixed_point(mdp, 2, temperature)[1],
+        "AD-SAC 0": fix.adsac_fixed_point(mdp, 2, temperature).policy,
+        "AD-SAC 0 argmin": fix.adsac_fixed_point(mdp, 2, temperature, data="lower_q").policy,
+        "AD-SAC 1": fix.adsac_fixed_point(mdp, 2, temperature, shorter=1).policy,
+        "BPQL": fix.bpql_fixed_point(mdp, 2, temperature).policy,
         "A-SAC": tab.soft_optimal(delayed.mdp, temperature)[1],
     }
     print(" " * 16 + "".join(f"{name:>15s}" for name in policies))
@@ -311,10 +320,24 @@ def fixed_point_numbers() -> None:
         print(f"{name:16s}{gaps}")
 
 
-def improved(mdp: tab.MDP, delay: int, shorter: int, temperature: float) -> Array:
-    """Return AD-SAC's delayed policy when its auxiliary task, with a shorter delay, is solved."""
-    q, _ = tab.soft_optimal(tab.augment(mdp, shorter).mdp, temperature)
-    return tab.softmax(tab.shorter_histories(mdp, delay, shorter) @ q / temperature)
+def minimum_numbers(count: int = 4) -> None:
+    heading(
+        f"AD-SAC without auxiliary delay, {count} random MDPs, delay 2, temperature 0.3; then the same without noise"
+    )
+    print(" " * 4 + "policy: from Eq. (11), from BPQL; Q: highest and lowest below Q*, highest below BPQL's; returns:")
+    print(" " * 4 + "Eq. (11), BPQL, AD-SAC, AD-SAC on argmin data, best delayed policy")
+    for seed, deterministic in product(range(count), (False, True)):
+        mdp, temperature = tab.random_mdp(np.random.default_rng(seed), deterministic=deterministic), 0.3
+        delayed = tab.augment(mdp, 2)
+        free_q, reference = tab.soft_optimal(mdp, temperature)
+        reverse = tab.geometric_mean(delayed.belief, reference)
+        bpql, adsac = fix.bpql_fixed_point(mdp, 2, temperature), fix.adsac_fixed_point(mdp, 2, temperature)
+        released = fix.adsac_fixed_point(mdp, 2, temperature, data="lower_q")
+        gaps = [np.abs(adsac.policy - policy).max() for policy in (reverse, bpql.policy)]
+        values = [(free_q - adsac.q).max(), (free_q - adsac.q).min(), (bpql.q - adsac.q).max()]
+        policies = (reverse, bpql.policy, adsac.policy, released.policy)
+        returns = [tab.policy_return(delayed.mdp, policy) for policy in policies]
+        row(f"seed {seed}", [*gaps, *values, *returns, tab.optimal_return(delayed.mdp)])
 
 
 def random_mdps(axes: Any, count: int = 50) -> None:
@@ -329,14 +352,18 @@ def random_mdps(axes: Any, count: int = 50) -> None:
         best = tab.optimal_return(delayed.mdp)
         uniform = tab.policy_return(delayed.mdp, np.full_like(delayed.mdp.reward, 1 / 3))
 
-        def imitate(data: tab.Data, forward: bool, mdp: tab.MDP = mdp) -> Array:
-            return tab.imitation_fixed_point(mdp, delay, temperature, data=data, forward=forward)
+        def imitate(data: fix.Data, forward: bool, mdp: tab.MDP = mdp) -> Array:
+            return fix.imitation_fixed_point(mdp, delay, temperature, data=data, forward=forward)
 
         policies = {
             "A-SAC": tab.soft_optimal(delayed.mdp, temperature)[1],
-            "BPQL": tab.bpql_fixed_point(mdp, delay, temperature)[1],
-            "AD-SAC, auxiliary delay 1": improved(mdp, delay, 1, temperature),
-            "reverse, own data\n(= AD-SAC, auxiliary delay 0)": imitate("delayed", False),
+            "BPQL": fix.bpql_fixed_point(mdp, delay, temperature).policy,
+            "AD-SAC, auxiliary delay 1": fix.adsac_fixed_point(mdp, delay, temperature, shorter=1).policy,
+            "AD-SAC, auxiliary delay 0,\nargmin data (as released)": fix.adsac_fixed_point(
+                mdp, delay, temperature, data="lower_q"
+            ).policy,
+            "AD-SAC, auxiliary delay 0,\nown data": fix.adsac_fixed_point(mdp, delay, temperature).policy,
+            "reverse, own data": imitate("delayed", False),
             "reverse, argmin data\n(as released VDPO)": imitate("lower_q", False),
             "reverse, reference's data": imitate("reference", False),
             "forward, own data\n(Eq. 7; DIDA, log loss)": imitate("delayed", True),
@@ -383,19 +410,6 @@ def direction_numbers() -> None:
         row(f"delay {delay}, temperature 0.03, 0.1, 0.3, 1", wins)
 
 
-def auxiliary_numbers(count: int = 50) -> None:
-    heading(f"AD-SAC with auxiliary delays 0, 1, 2, 3; delay 3, temperature 0.1, {count} random MDPs")
-    scores = []
-    for seed in range(count):
-        mdp = tab.random_mdp(np.random.default_rng(seed))
-        delayed = tab.augment(mdp, 3).mdp
-        uniform = tab.policy_return(delayed, np.full_like(delayed.reward, 1 / 3))
-        reached = np.array([tab.policy_return(delayed, improved(mdp, 3, shorter, 0.1)) for shorter in range(4)])
-        scores.append((reached - uniform) / (tab.optimal_return(delayed) - uniform))
-    row("mean", np.mean(scores, axis=0).tolist())
-    row("min", np.min(scores, axis=0).tolist())
-
-
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "img"
     folder.mkdir(parents=True, exist_ok=True)
@@ -416,9 +430,9 @@ def main() -> None:
 
     fixed_point_numbers()
     direction_numbers()
-    auxiliary_numbers()
+    minimum_numbers()
 
-    figure, panel = plt.subplots(figsize=(8.5, 4.6), layout="constrained")
+    figure, panel = plt.subplots(figsize=(8.5, 5.4), layout="constrained")
     random_mdps(panel)
     figure.savefig(folder / "theory-random.png", dpi=150)
 

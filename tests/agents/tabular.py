@@ -8,9 +8,9 @@ Convention for the start of an episode: the first observation is s_0 with age 0,
 min(t, delay). No action is invented: an augmented state is one observed state and as many actions as its age.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +63,13 @@ class Windows:
         mdp: MDP over Y windows (s_{t-age}, a_{t-age}, ..., a_{t-1}, s_t).
         augmented: Index of x_t for each window, shape (Y,).
         state: Index of s_t for each window, shape (Y,).
+        shorter: Index of x^τ_t, the history under a shorter delay, for each window, shape (Y,).
     """
 
     mdp: MDP
     augmented: Indices
     state: Indices
+    shorter: Indices
 
 
 # ---- MDPs --------------------------------------------------------------------------------------------------
@@ -250,8 +252,8 @@ def state_given_history(
     return np.stack(rows)
 
 
-def window_process(mdp: MDP, delay: int) -> Windows:
-    """Return the true process as an MDP over windows; it makes no use of any belief."""
+def window_process(mdp: MDP, delay: int, shorter: int = 0) -> Windows:
+    """Return the true process as an MDP over windows, with the histories for two delays. It uses no belief."""
     states, actions = mdp.reward.shape
     index: dict[tuple[tuple[int, ...], tuple[int, ...]], int] = {}
     for age in range(delay + 1):
@@ -266,103 +268,17 @@ def window_process(mdp: MDP, delay: int) -> Windows:
                 to = index[(*visited, arrived)[drop:], (*taken, action)[drop:]]
                 transition[row, action, to] = mdp.transition[visited[-1], action, arrived]
     state = np.array([visited[-1] for visited, _ in index])
-    known = {history: i for i, history in enumerate(augment(mdp, delay).histories)}
-    augmented = np.array([known[visited[0], taken] for visited, taken in index])
     initial = np.zeros(len(index))
     initial[:states] = mdp.initial
-    return Windows(MDP(transition, mdp.reward[state], initial, mdp.discount), augmented, state)
+    process = MDP(transition, mdp.reward[state], initial, mdp.discount)
+    return Windows(process, seen_late(mdp, index, delay), state, seen_late(mdp, index, shorter))
 
 
-# ---- Trajectories ------------------------------------------------------------------------------------------
-
-
-def all_trajectories(mdp: MDP, horizon: int) -> tuple[Indices, Indices]:
-    """Return the states and the actions of every trajectory s_0, a_0, ..., s_{T-1}, a_{T-1}, each (N, T)."""
-    states, actions = mdp.reward.shape
-    table = np.indices((states, actions) * horizon).reshape(2 * horizon, -1).T
-    return table[:, 0::2], table[:, 1::2]
-
-
-def dynamics_probability(mdp: MDP, states: Indices, actions: Indices) -> Array:
-    """Return ρ(s_0) ∏ P(s_{t+1} | s_t, a_t) of each trajectory, shape (N,), for states and actions (N, T)."""
-    steps = mdp.transition[states[:, :-1], actions[:, :-1], states[:, 1:]]
-    return mdp.initial[states[:, 0]] * steps.prod(axis=1)
-
-
-def augmented_indices(delayed: DelayedMDP, delay: int, states: Indices, actions: Indices) -> Indices:
-    """Return the index of x_t at each step of each trajectory; states, actions and result are (N, T)."""
-    index = {history: i for i, history in enumerate(delayed.histories)}
-    columns = []
-    for step in range(states.shape[1]):
-        first = max(step - delay, 0)
-        rows = zip(states[:, first].tolist(), actions[:, first:step].tolist(), strict=True)
-        columns.append([index[state, tuple(taken)] for state, taken in rows])
-    return np.array(columns).T
-
-
-@dataclass(frozen=True)
-class TrajectoryKL:
-    """What Proposition 3.3 of VDPO relates, over all trajectories of some length.
-
-    Attributes:
-        trajectory: KL(p_π(τ) ‖ p_πΔ(τ)), both laws of trajectories of the true process.
-        joint: Σ_t E KL(π(· | s_t) ‖ π_Δ(· | x_t)) over (s_t, x_t) as π visits them.
-        belief: The same, over x_t as π visits it and s_t drawn from b(· | x_t).
-        independent: The same, over s_t and x_t as π visits each, drawn apart.
-        minimiser_excess: Σ_t E KL(q(· | x_t) ‖ π_Δ(· | x_t)) for q the posterior mixture of π's data.
-        mass: Total of p_πΔ(τ).
-        printed_constant: The constant that the printed p_πΔ(τ), with its factors b(s_t | x_t), leaves over.
-        printed_mass: Total of the printed p_πΔ(τ) over trajectories.
-    """
-
-    trajectory: float
-    joint: float
-    belief: float
-    independent: float
-    minimiser_excess: float
-    mass: float
-    printed_constant: float
-    printed_mass: float
-
-
-def trajectory_kl(mdp: MDP, delay: int, reference: Array, policy: Array, horizon: int = 4) -> TrajectoryKL:
-    """Enumerate all trajectories under the true process.
-
-    Args:
-        mdp: The MDP.
-        delay: Steps.
-        reference: π(a | s), positive, shape (S, A).
-        policy: π_Δ(a | x), positive, shape (X, A).
-        horizon: Steps in a trajectory.
-
-    Returns:
-        Both sides of the proposition, and its other readings.
-    """
-    delayed = augment(mdp, delay)
-    states, actions = all_trajectories(mdp, horizon)
-    x = augmented_indices(delayed, delay, states, actions)
-    dynamics = dynamics_probability(mdp, states, actions)
-    reference_law = dynamics * reference[states, actions].prod(axis=1)
-    chosen = policy[x, actions].prod(axis=1)
-    by_belief = (delayed.belief * kl(reference, policy[:, None])).sum(axis=1)
-    independent = 0.0
-    for step in range(horizon):
-        of_state = np.bincount(states[:, step], reference_law, minlength=len(reference))
-        of_history = np.bincount(x[:, step], reference_law, minlength=len(policy))
-        independent += float(of_history @ kl(reference, policy[:, None]) @ of_state)
-    best = mixture(state_given_history(mdp, delayed.histories, reference), reference)
-    printed = delayed.mdp.initial[x[:, 0]] * delayed.belief[x, states].prod(axis=1)
-    printed = printed * delayed.mdp.transition[x[:, :-1], actions[:, :-1], x[:, 1:]].prod(axis=1)
-    return TrajectoryKL(
-        trajectory=float(kl(reference_law, dynamics * chosen)),
-        joint=float(reference_law @ kl(reference[states], policy[x]).sum(axis=1)),
-        belief=float(reference_law @ by_belief[x].sum(axis=1)),
-        independent=independent,
-        minimiser_excess=float(reference_law @ kl(best, policy)[x].sum(axis=1)),
-        mass=float((dynamics * chosen).sum()),
-        printed_constant=float(kl(reference_law, printed * reference[states, actions].prod(axis=1))),
-        printed_mass=float((printed * chosen).sum()),
-    )
+def seen_late(mdp: MDP, windows: Iterable[tuple[tuple[int, ...], tuple[int, ...]]], delay: int) -> Indices:
+    """Return the index of the history that a delay leaves of each window of states and actions, shape (Y,)."""
+    known = {history: i for i, history in enumerate(augment(mdp, delay).histories)}
+    ages = [(visited, taken, min(len(taken), delay)) for visited, taken in windows]
+    return np.array([known[visited[-1 - age], taken[len(taken) - age :]] for visited, taken, age in ages])
 
 
 # ---- Policies from a belief --------------------------------------------------------------------------------
@@ -411,163 +327,3 @@ def geometric_mean(belief: Array, policy: Array) -> Array:
         Shape (X, A).
     """
     return softmax(belief @ np.log(policy))
-
-
-def shorter_histories(mdp: MDP, delay: int, shorter: int) -> Array:
-    """Return the law of the history under a shorter delay, given the history under the longer one.
-
-    The belief is the case shorter = 0.
-
-    Args:
-        mdp: The MDP.
-        delay: The longer delay, X histories.
-        shorter: The shorter delay, Z histories.
-
-    Returns:
-        Shape (X, Z).
-    """
-    index = {history: i for i, history in enumerate(augment(mdp, shorter).histories)}
-    histories = augment(mdp, delay).histories
-    law = np.zeros((len(histories), len(index)))
-    for row, (state, taken) in enumerate(histories):
-        split = max(len(taken) - shorter, 0)
-        between = state_given_history(mdp, [(state, taken[:split])])[0]
-        for arrived, probability in enumerate(between):
-            law[row, index[arrived, taken[split:]]] = probability
-    return law
-
-
-Data = Literal["reference", "delayed", "lower_q"]
-
-
-def imitation_fixed_point(mdp: MDP, delay: int, temperature: float, *, data: Data, forward: bool) -> Array:
-    """Imitate the soft-optimal delay-free policy on data that a given behaviour collects.
-
-    Imitation averages over p(s_t | x_t) in its data: the belief only if the behaviour saw no more than x_t.
-
-    Args:
-        mdp: The MDP.
-        delay: Steps.
-        temperature: α of the reference.
-        data: Who acts: the reference on the true state, the delayed policy itself (as in DAgger), or, as in
-            the released VDPO code, whichever of their two sampled actions has the lower Q at the true state.
-        forward: Minimise KL(π ‖ π_Δ), giving a mixture; otherwise KL(π_Δ ‖ π), giving a geometric mean.
-
-    Returns:
-        The delayed policy, shape (X, A).
-    """
-    q, reference = soft_optimal(mdp, temperature)
-    belief = augment(mdp, delay).belief
-    windows = window_process(mdp, delay)
-    project = mixture if forward else geometric_mean
-    policy = project(belief, reference)
-    for _ in range(500):
-        delayed, free = policy[windows.augmented], reference[windows.state]
-        both = free[:, :, None] * delayed[:, None, :]
-        free_is_lower = q[windows.state][:, :, None] < q[windows.state][:, None, :]
-        lower = (both * free_is_lower).sum(axis=2) + (both * ~free_is_lower).sum(axis=1)
-        acting = {"reference": free, "delayed": delayed, "lower_q": lower}[data]
-        law = state_law_in_data(windows, acting, belief)
-        updated = project(law, reference)
-        if np.abs(updated - policy).max() < 1e-10:
-            return updated
-        policy = 0.5 * (policy + updated)  # damped: the policy and its data change together
-    raise RuntimeError("imitation did not settle")
-
-
-def state_law_in_data(windows: Windows, behaviour: Array, unmet: Array) -> Array:
-    """Return p(s_t | x_t) in the data of a behaviour that may use the whole window.
-
-    Args:
-        windows: The window process.
-        behaviour: Shape (Y, A).
-        unmet: What to return for histories that the behaviour never meets, shape (X, S).
-
-    Returns:
-        Shape (X, S).
-    """
-    joint = np.zeros_like(unmet)
-    np.add.at(joint, (windows.augmented, windows.state), occupancy(windows.mdp, behaviour))
-    total = joint.sum(axis=1, keepdims=True)
-    return np.where(total > 1e-200, joint / np.maximum(total, 1e-300), unmet)
-
-
-def bpql_fixed_point(mdp: MDP, delay: int, temperature: float) -> tuple[Array, Array]:
-    """Iterate BPQL's two steps to their common fixed point, on the delayed policy's own data.
-
-    The critic sees the true state and the actor the history. So Q(s, a) is the average of the soft target
-    over the windows that end in s, weighted by how often the delayed policy meets them, and the policy is
-    ∝ exp(E_b[Q(s, a)]/α).
-
-    Args:
-        mdp: The MDP.
-        delay: Steps.
-        temperature: α.
-
-    Returns:
-        Q, shape (S, A), and the delayed policy, shape (X, A).
-    """
-    states, actions = mdp.reward.shape
-    belief = augment(mdp, delay).belief
-    windows = window_process(mdp, delay)
-    ends_in = np.eye(states)[windows.state]
-    q, _ = soft_optimal(mdp, temperature)
-    for _ in range(1000):
-        policy = softmax(belief @ q / temperature)
-        acting = policy[windows.augmented]
-        share = ends_in.T * occupancy(windows.mdp, acting)  # (S, Y)
-        total = np.maximum(share @ acting, 1e-300)
-        reached = np.stack([(share * acting[:, a]) @ windows.mdp.transition[:, a] for a in range(actions)], axis=1)
-        reached = reached / total[..., None]  # law of the next window after s and a, (S, A, Y)
-        next_entropy = -temperature * (acting * np.log(np.maximum(acting, 1e-300))).sum(axis=1)
-        chosen = (ends_in[:, :, None] * acting[:, None, :]).reshape(len(acting), -1)
-        chain = (reached @ chosen).reshape(states * actions, -1)
-        constant = mdp.reward + mdp.discount * reached @ next_entropy
-        solved = np.linalg.solve(np.eye(len(chain)) - mdp.discount * chain, constant.ravel()).reshape(q.shape)
-        if np.abs(solved - q).max() < 1e-11:
-            return solved, softmax(belief @ solved / temperature)
-        q = 0.5 * (q + solved)  # damped: the policy and its data change together
-    raise RuntimeError("BPQL's two steps did not settle")
-
-
-# ---- Gaussians ---------------------------------------------------------------------------------------------
-
-
-def gaussian_kl(mean: Array, variance: Array, other_mean: Array, other_variance: Array) -> Array:
-    """Return KL(N(mean, variance) ‖ N(other_mean, other_variance)), diagonal, summed over the last axis."""
-    ratio = variance / other_variance
-    return 0.5 * (ratio - 1 - np.log(ratio) + (mean - other_mean) ** 2 / other_variance).sum(axis=-1)
-
-
-def moment_match(weight: Array, mean: Array, variance: Array) -> tuple[Array, Array]:
-    """Return the diagonal Gaussian q that minimises the forward objective E KL(N(μ_s, σ_s²) ‖ q).
-
-    It has the mean and the variances of the mixture: E[μ_s] and E[σ_s² + μ_s²] - E[μ_s]².
-
-    Args:
-        weight: Belief over the N Gaussians, shape (N,).
-        mean: μ_s, shape (N, D).
-        variance: σ_s², shape (N, D).
-
-    Returns:
-        Mean and variance of q, both of shape (D,).
-    """
-    centre = weight @ mean
-    return centre, weight @ (variance + (mean - centre) ** 2)
-
-
-def precision_weighted(weight: Array, mean: Array, variance: Array) -> tuple[Array, Array]:
-    """Return the diagonal Gaussian q that minimises the reverse objective E KL(q ‖ N(μ_s, σ_s²)).
-
-    It is the normalised geometric mean of the Gaussians: 1/σ² = E[1/σ_s²] and μ = σ² E[μ_s/σ_s²].
-
-    Args:
-        weight: Belief over the N Gaussians, shape (N,).
-        mean: μ_s, shape (N, D).
-        variance: σ_s², shape (N, D).
-
-    Returns:
-        Mean and variance of q, both of shape (D,).
-    """
-    joint_variance = 1 / (weight @ (1 / variance))
-    return joint_variance * (weight @ (mean / variance)), joint_variance

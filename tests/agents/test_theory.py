@@ -1,4 +1,4 @@
-"""The theory of delayed imitation, checked exactly on small MDPs; docs/theory.md explains each test.
+"""The theory of delayed imitation, checked exactly on small MDPs; docs/theory.md (sections 1 to 3) explains each test.
 
 Numbers of equations and propositions are those of VDPO (Wu et al., NeurIPS 2024).
 """
@@ -8,37 +8,29 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize, minimize_scalar
+from fixed_points import state_law_in_data
+from scipy.optimize import minimize
 from tabular import (
     MDP,
     Array,
-    Data,
     augment,
-    bpql_fixed_point,
     evaluate,
-    gaussian_kl,
     geometric_mean,
-    guessing_game,
-    imitation_fixed_point,
     kl,
     mixture,
-    moment_match,
     occupancy,
     optimal_policy,
     optimal_return,
     optimal_value,
     policy_return,
-    precision_weighted,
     random_mdp,
-    shorter_histories,
     soft_optimal,
     softmax,
     state_given_history,
-    state_law_in_data,
     tracking,
-    trajectory_kl,
     window_process,
 )
+from trajectories import trajectory_kl
 
 seeds = pytest.mark.parametrize("seed", range(4))
 delays = pytest.mark.parametrize("delay", range(4))
@@ -89,6 +81,15 @@ def test_soft_optimal_policy_is_greedy_for_its_own_value(seed: int) -> None:
     entropy = -(policy * np.log(policy)).sum(axis=1, keepdims=True)
     value = evaluate(MDP(mdp.transition, mdp.reward + temperature * entropy, mdp.initial, mdp.discount), policy)
     np.testing.assert_allclose(mdp.reward + mdp.discount * mdp.transition @ value, q, atol=1e-9)
+
+
+def test_occupancy_is_a_distribution() -> None:
+    mdp = random_mdp(generator(0))
+    _, policy = soft_optimal(mdp, 0.3)
+    share = occupancy(mdp, policy)
+    assert share.sum() == pytest.approx(1)
+    reward = (policy * mdp.reward).sum(axis=1)
+    assert share @ reward == pytest.approx((1 - mdp.discount) * policy_return(mdp, policy))
 
 
 # ---- 1. What delay costs (Lemma 3.1) -----------------------------------------------------------------------
@@ -333,240 +334,3 @@ def test_cold_limits(seed: int) -> None:
     np.testing.assert_allclose(
         mixture(belief, softmax(q / temperature)), mixture(belief, optimal_policy(mdp)), atol=1e-3
     )
-
-
-# ---- 4. Gaussians ------------------------------------------------------------------------------------------
-
-
-def gaussian_references(seed: int) -> tuple[Array, Array, Array]:
-    rng = generator(seed)
-    return rng.dirichlet(np.ones(5)), rng.normal(size=(5, 2)), np.exp(rng.normal(size=(5, 2)))
-
-
-@seeds
-@pytest.mark.parametrize("forward", [True, False])
-def test_closed_forms_for_gaussians(seed: int, forward: bool) -> None:
-    weight, mean, variance = gaussian_references(seed)
-
-    def objective(parameters: Array) -> float:
-        own_mean, own_variance = parameters[:2], np.exp(parameters[2:])
-        if forward:
-            return float(weight @ gaussian_kl(mean, variance, own_mean, own_variance))
-        return float(weight @ gaussian_kl(own_mean, own_variance, mean, variance))
-
-    found = minimize(objective, np.zeros(4), tol=1e-12).x
-    best_mean, best_variance = (moment_match if forward else precision_weighted)(weight, mean, variance)
-    np.testing.assert_allclose(found[:2], best_mean, atol=1e-4)
-    np.testing.assert_allclose(np.exp(found[2:]), best_variance, rtol=1e-4)
-
-
-@seeds
-def test_gaussian_closed_forms_are_the_moments_of_the_two_means(seed: int) -> None:
-    """On a grid: the forward minimiser has the mixture's moments, the reverse one is the geometric mean."""
-    weight, mean, variance = gaussian_references(seed)
-    mean, variance = mean[:, :1], variance[:, :1]
-    grid = np.linspace(-30, 30, 20001)
-    density = np.exp(-((grid - mean) ** 2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-    for function, shape in ((moment_match, weight @ density), (precision_weighted, None)):
-        if shape is None:
-            shape = np.exp(weight @ np.log(np.maximum(density, 1e-300)))
-        shape = shape / shape.sum()
-        centre = shape @ grid
-        best_mean, best_variance = function(weight, mean, variance)
-        assert best_mean[0] == pytest.approx(centre, abs=1e-6)
-        assert best_variance[0] == pytest.approx(shape @ (grid - centre) ** 2, rel=1e-6)
-
-
-def test_equal_widths_differ_in_width_only() -> None:
-    """Two references at ±1, equally wide and likely: both minimisers sit between them, on neither."""
-    weight, mean, variance = np.array([0.5, 0.5]), np.array([[-1.0], [1.0]]), np.full((2, 1), 0.04)
-    np.testing.assert_allclose(moment_match(weight, mean, variance), [[0.0], [1.04]], atol=1e-12)
-    np.testing.assert_allclose(precision_weighted(weight, mean, variance), [[0.0], [0.04]], atol=1e-12)
-    sharper = np.array([[0.01], [0.09]])
-    np.testing.assert_allclose(precision_weighted(weight, mean, sharper), [[-0.8], [0.018]], atol=1e-12)
-    np.testing.assert_allclose(moment_match(weight, mean, sharper), [[0.0], [1.05]], atol=1e-12)
-
-
-def test_averaged_reverse_kl_does_not_seek_modes() -> None:
-    """KL(q ‖ E_b[π]) picks one mode; E_b KL(q ‖ π), which VDPO minimises, sits between them."""
-    grid = np.linspace(-4, 4, 4001)
-    width = grid[1] - grid[0]
-
-    def log_density(mean: float, deviation: float) -> Array:
-        density: Array = -0.5 * ((grid - mean) / deviation) ** 2 - np.log(deviation * np.sqrt(2 * np.pi))
-        return density
-
-    left, right = log_density(-1.0, 0.2), log_density(1.0, 0.2)
-    both = np.logaddexp(left, right) - np.log(2)
-
-    def to_the_mixture(parameters: Array) -> float:
-        own = log_density(parameters[0], np.exp(parameters[1]))
-        return float((np.exp(own) * (own - both)).sum() * width)
-
-    mode = minimize(to_the_mixture, np.array([0.3, -1.0]), tol=1e-10).x
-    assert mode[0] == pytest.approx(1, abs=1e-3)
-    assert np.exp(mode[1]) == pytest.approx(0.2, abs=1e-3)
-    between, _ = precision_weighted(np.array([0.5, 0.5]), np.array([[-1.0], [1.0]]), np.full((2, 1), 0.04))
-    assert between == pytest.approx(0)
-
-
-# ---- 5. Fixed points of the other methods (Lemma 3.7, Proposition 3.8) -------------------------------------
-
-
-@seeds
-def test_dida_reaches_the_mixture_only_with_a_likelihood(seed: int) -> None:
-    """Discrete actions, DAgger's data: log loss gives the mixture, 0-1 loss the mixture's mode alone."""
-    mdp = random_mdp(generator(seed))
-    _, expert = soft_optimal(mdp, 0.3)
-    belief = augment(mdp, 1).belief[-1]
-    target = mixture(belief, expert)
-    log_loss = best_distribution(lambda q: -float(target @ np.log(q)), 3)
-    np.testing.assert_allclose(log_loss, target, atol=1e-5)
-    wrong = [1 - target[action] for action in range(3)]
-    assert int(np.argmin(wrong)) == int(target.argmax())
-    assert np.abs(np.eye(3)[target.argmax()] - target).max() > 0.01
-
-
-def test_dida_with_a_deterministic_student_takes_the_median_or_the_mean() -> None:
-    """One action per history cannot be the mixture: L1 (the released loss) gives the median."""
-    belief, expert = np.array([0.30, 0.25, 0.45]), np.array([-1.0, -0.6, 1.0])
-    l1 = minimize_scalar(lambda a: float(belief @ np.abs(expert - a)), bounds=(-1, 1), method="bounded")
-    l2 = minimize_scalar(lambda a: float(belief @ (expert - a) ** 2), bounds=(-1, 1), method="bounded")
-    assert l1.x == pytest.approx(-0.6, abs=1e-4)
-    assert l2.x == pytest.approx(0.0, abs=1e-6)
-    assert belief @ expert == pytest.approx(0.0)
-    width = np.full((3, 1), 1e-12)
-    assert moment_match(belief, expert[:, None], width)[1] == pytest.approx(0.84)  # the mixture's variance, lost
-
-
-@seeds
-@pytest.mark.parametrize("data", ["reference", "delayed", "lower_q"])
-def test_imitation_reaches_the_belief_mixture_only_on_its_own_data(seed: int, data: Data) -> None:
-    """Forward KL with Δ = 2: DAgger's data gives Eq. (7), the reference's data the posterior mixture."""
-    mdp = random_mdp(generator(seed), states=3, actions=2)
-    _, reference = soft_optimal(mdp, 0.3)
-    delayed = augment(mdp, 2)
-    found = imitation_fixed_point(mdp, 2, 0.3, data=data, forward=True)
-    gap = np.abs(found - mixture(delayed.belief, reference)).max()
-    assert gap < 1e-9 if data == "delayed" else gap > 1e-3
-    if data == "reference":
-        posterior = state_given_history(mdp, delayed.histories, reference)
-        np.testing.assert_allclose(found, mixture(posterior, reference), atol=1e-9)
-
-
-def test_imitating_the_reference_on_its_own_data_latches() -> None:
-    """Tracking, Δ = 2: the student takes its own last action for evidence and repeats it for ever."""
-    mdp, temperature = tracking(), 0.1
-    delayed = augment(mdp, 2)
-    blind = 0.5 / (1 - mdp.discount)
-    found = {
-        (data, forward): policy_return(
-            delayed.mdp, imitation_fixed_point(mdp, 2, temperature, data=data, forward=forward)
-        )
-        for data in ("reference", "delayed", "lower_q")
-        for forward in (True, False)
-    }
-    assert optimal_return(delayed.mdp) == pytest.approx(16.656, abs=1e-3)
-    assert found["delayed", False] == pytest.approx(16.636, abs=2e-3)
-    assert found["delayed", True] == pytest.approx(14.500, abs=2e-3)
-    assert found["reference", True] < blind + 1.5
-    assert found["reference", False] < blind + 2.2
-    assert found["lower_q", False] == pytest.approx(found["delayed", False], abs=1e-2)
-    assert found["lower_q", True] == pytest.approx(found["delayed", True], abs=1e-2)
-    repeats = imitation_fixed_point(mdp, 2, temperature, data="reference", forward=False)
-    rows = [delayed.histories.index((state, (0, last))) for state in range(2) for last in range(2)]
-    assert [int(repeats[row].argmax()) for row in rows] == [0, 1, 0, 1]
-
-
-@seeds
-@pytest.mark.parametrize("shorter", [0, 1, 2])
-def test_ad_sac_reaches_a_geometric_mean(seed: int, shorter: int) -> None:
-    """With the auxiliary task solved. Without auxiliary delay it is VDPO's reverse minimiser, not Eq. (7)."""
-    mdp, temperature = random_mdp(generator(seed)), 0.3
-    auxiliary, delayed = augment(mdp, shorter), augment(mdp, 2)
-    q, policy = soft_optimal(auxiliary.mdp, temperature)
-    law = shorter_histories(mdp, 2, shorter)
-    improved = softmax(law @ q / temperature)
-    np.testing.assert_allclose(improved, geometric_mean(law, policy), atol=1e-10)
-    _, reference = soft_optimal(mdp, temperature)
-    if shorter == 0:
-        np.testing.assert_allclose(law, delayed.belief, atol=1e-12)
-        np.testing.assert_allclose(improved, geometric_mean(delayed.belief, reference), atol=1e-10)
-    if shorter == 2:  # no step is left to average over: this is soft policy iteration on x_t
-        np.testing.assert_allclose(improved, soft_optimal(delayed.mdp, temperature)[1], atol=1e-10)
-    assert np.abs(improved - mixture(delayed.belief, reference)).max() > 0.1
-
-
-@seeds
-def test_bpql_has_a_fixed_point_of_its_own(seed: int) -> None:
-    """A geometric mean of what its own critic finds soft-greedy; neither mean of the delay-free optimum."""
-    mdp, temperature = random_mdp(generator(seed), states=3), 0.3
-    q, policy = bpql_fixed_point(mdp, 1, temperature)
-    belief = augment(mdp, 1).belief
-    free_q, reference = soft_optimal(mdp, temperature)
-    np.testing.assert_allclose(policy, geometric_mean(belief, softmax(q / temperature)), atol=1e-10)
-    assert (q < free_q - 1e-3).all()  # its critic knows that the next action will be late too
-    assert np.abs(policy - geometric_mean(belief, reference)).max() > 1e-3
-    assert np.abs(policy - mixture(belief, reference)).max() > 0.1
-    assert np.abs(policy - mixture(belief, softmax(q / temperature))).max() > 0.1
-
-
-@seeds
-@pytest.mark.parametrize("delay", [1, 2])
-def test_all_fixed_points_agree_without_noise(seed: int, delay: int) -> None:
-    """Deterministic transitions: every belief is a point, where every method has the reference's policy."""
-    mdp, temperature = random_mdp(generator(seed), states=3, actions=2, deterministic=True), 0.3
-    delayed = augment(mdp, delay)
-    _, reference = soft_optimal(mdp, temperature)
-    expected = delayed.belief @ reference
-    for policy in (
-        mixture(delayed.belief, reference),
-        geometric_mean(delayed.belief, reference),
-        bpql_fixed_point(mdp, delay, temperature)[1],
-        soft_optimal(delayed.mdp, temperature)[1],
-        imitation_fixed_point(mdp, delay, temperature, data="reference", forward=True),
-        imitation_fixed_point(mdp, delay, temperature, data="lower_q", forward=False),
-    ):
-        np.testing.assert_allclose(policy, expected, atol=1e-8)
-    assert policy_return(delayed.mdp, expected) == pytest.approx(policy_return(mdp, reference), abs=1e-8)
-
-
-# ---- 6. What the choice costs ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("wrong_cost", "mixture_wins"), [(0.0, True), (0.5, True), (2.0, False), (4.0, False)])
-def test_either_mean_can_be_the_better_one(wrong_cost: float, mixture_wins: bool) -> None:
-    """Guess a side that stays hidden: the mixture guesses at once, the geometric mean waits for ever."""
-    mdp = guessing_game(wrong_cost)
-    delayed = augment(mdp, 1)
-    _, reference = soft_optimal(mdp, 0.02)
-    guess = mdp.discount * (1 - wrong_cost) / 2
-    wait = -0.02 * mdp.discount / (1 - mdp.discount)
-    by_mixture = policy_return(delayed.mdp, mixture(delayed.belief, reference))
-    by_geometric = policy_return(delayed.mdp, geometric_mean(delayed.belief, reference))
-    best = optimal_return(delayed.mdp)
-    assert by_mixture == pytest.approx(guess, abs=1e-2)
-    assert by_geometric == pytest.approx(wait, abs=1e-2)
-    assert best == pytest.approx(max(guess, wait), abs=1e-9)
-    assert (by_mixture > by_geometric) is mixture_wins
-    assert best - min(by_mixture, by_geometric) > 0.25  # a gap that no number of samples closes (Lemma 3.5)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_geometric_mean_wins_on_random_mdps(seed: int) -> None:
-    """And no delayed policy beats the best delayed policy."""
-    mdp, temperature = random_mdp(generator(seed)), 0.1
-    delayed = augment(mdp, 2)
-    _, reference = soft_optimal(mdp, temperature)
-    by_mixture = policy_return(delayed.mdp, mixture(delayed.belief, reference))
-    by_geometric = policy_return(delayed.mdp, geometric_mean(delayed.belief, reference))
-    assert by_mixture < by_geometric <= optimal_return(delayed.mdp) + 1e-9
-
-
-def test_occupancy_is_a_distribution() -> None:
-    mdp = random_mdp(generator(0))
-    _, policy = soft_optimal(mdp, 0.3)
-    share = occupancy(mdp, policy)
-    assert share.sum() == pytest.approx(1)
-    reward = (policy * mdp.reward).sum(axis=1)
-    assert share @ reward == pytest.approx((1 - mdp.discount) * policy_return(mdp, policy))
