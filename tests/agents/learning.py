@@ -8,7 +8,7 @@ import numpy as np
 
 from conftest import learned, record
 from delayrl.core import replay as ring
-from delayrl.core.types import Seen, Spec
+from delayrl.core.types import Seen, Spec, Window
 from delayrl.training.learner import Program
 
 ENV, OBS, ACT = "Reacher-v5", 10, 2
@@ -50,3 +50,24 @@ def seen(delay: int, age: int, rng: np.random.Generator, truth: bool = False) ->
     actions[:age] = rng.uniform(-1, 1, (age, ACT))
     obs = rng.normal(size=(2, OBS)).astype(np.float32)
     return Seen(jnp.asarray(obs[0]), jnp.int32(age), jnp.asarray(actions), jnp.asarray(obs[1]) if truth else None)
+
+
+def random_windows(spec: Spec, batch: int = 8, ahead: int = 3) -> Window:
+    """Windows full of random numbers, with every k and some terminations."""
+    rng, time = np.random.default_rng(0), spec.delay + 1 + ahead
+
+    def normal(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.normal(size=(batch, time, *shape)), jnp.float32)
+
+    return Window(
+        obs=normal(spec.obs_size),
+        age=jnp.full((batch, time), spec.delay, jnp.int32),
+        action=jnp.tanh(normal(spec.action_size)),
+        reward=normal(),
+        terminated=jnp.asarray(rng.random((batch, time)) < 0.3),
+        valid=jnp.ones((batch, time), bool),
+        lead=jnp.full(batch, ahead, jnp.int32),
+        n_step=jnp.arange(batch, dtype=jnp.int32) % ahead + 1,
+        delay=spec.delay,
+        log_scale=spec.log_scale,
+    )

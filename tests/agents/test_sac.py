@@ -1,13 +1,18 @@
 """SAC on two views: SAC, memoryless SAC, A-SAC, BPQL."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
-from learning import ACT, ENV, OBS, counted, same, seen, trained
+from learning import ACT, ENV, OBS, counted, random_windows, same, seen, trained
 
 from conftest import TINY, TINY_SAC, record
+from delayrl.agents.sac import SAC, State
 from delayrl.agents.vdpo import VDPO
+from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.types import Spec
 from delayrl.errors import DelayRLError
@@ -68,7 +73,7 @@ def test_bpql_is_aligned() -> None:
 
 def test_sac_needs_the_current_state() -> None:
     with pytest.raises(DelayRLError, match="delay-free reference"):
-        TINY_SAC.init(Spec(OBS, ACT, 5), jax.random.key(0))
+        TINY_SAC.init(Spec(OBS, ACT, 1), jax.random.key(0))
     with pytest.raises(DelayRLError, match="at least 1 step"):
         VDPO().init(Spec(OBS, ACT, 0), jax.random.key(0))
 
@@ -91,3 +96,100 @@ def test_actor_and_temperature_move_every_second_time() -> None:
     expected = jax.tree.map(lambda t, c: 0.995 * t + 0.005 * c, state.target, even.critic)
     for a, b in zip(jax.tree.leaves(even.target), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-8)
+
+
+SPEC = Spec(OBS, ACT, 0, log_scale=0.7)
+RATES = {"actor_learning_rate": 1e-3, "critic_learning_rate": 2e-3, "temperature_learning_rate": 4e-3}
+
+
+def started(**options) -> tuple[SAC, State]:
+    """A SAC whose target critics are not its critics, and whose temperature is 0.5."""
+    agent = dataclasses.replace(TINY_SAC, **RATES, **options)
+    state = agent.init(SPEC, jax.random.key(0))
+    other = agent.init(SPEC, jax.random.key(1)).critic
+    return agent, state._replace(target=other, log_temperature=jnp.log(jnp.float32(0.5)))
+
+
+def adams_first_step(old, gradient, rate: float):
+    return jax.tree.map(lambda x, g: x - rate * g / (jnp.abs(g) + 1e-8), old, gradient)
+
+
+def near(a, b) -> None:
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["task", "scaled"])
+def test_critic_target_by_hand(unit: str) -> None:
+    """Y = Σ_{j<k} γ^j r_{t+j} + γ^k (1 - terminated) (min Q̄(s_{t+k}, a) - α log π(a|s_{t+k})), with each sample's k."""
+    agent, state = started(entropy_unit=unit)
+    windows, key = random_windows(SPEC), jax.random.key(5)
+    new, metrics = jax.jit(agent.update)(state, windows, key, jnp.int32(0))
+    k = np.asarray(windows.n_step)
+    later = windows.obs[np.arange(8), k]
+    action, log_prob = networks.sample(agent.policy(state.actor, later), jax.random.split(key)[0])
+    log_prob = np.asarray(log_prob) - (0.7 if unit == "task" else 0)
+    value = np.asarray(networks.twin(state.target, later, action)).min(0) - 0.5 * log_prob
+    rewards, ended = np.asarray(windows.reward), np.asarray(windows.terminated)[np.arange(8), k - 1]
+    assert 0 < ended.sum() < 8
+    y = [sum(0.99**j * rewards[i, j] for j in range(k[i])) + 0.99 ** k[i] * (1 - ended[i]) * value[i] for i in range(8)]
+
+    def loss(critic) -> jax.Array:
+        q = networks.twin(critic, windows.obs[:, 0], windows.action[:, 0])
+        return ((q - jnp.asarray(y)) ** 2).mean(1).sum()
+
+    error, gradient = jax.value_and_grad(loss)(state.critic)
+    np.testing.assert_allclose(metrics["critic_loss"], error, rtol=1e-4)
+    np.testing.assert_allclose(metrics["entropy"], -log_prob.mean(), rtol=1e-4)
+    near(new.critic, adams_first_step(state.critic, gradient, 2e-3))
+    near(new.target, optax.incremental_update(new.critic, state.target, 5e-3))
+
+
+def test_actor_by_hand() -> None:
+    """One step of Adam down α log π(a|s) - min Q(s, a), with the critics and not their targets, and the penalty."""
+    agent, state = started()
+    x, key = random_windows(SPEC).obs[:, 0], jax.random.key(2)
+
+    def loss(actor) -> jax.Array:
+        policy = agent.policy(actor, x)
+        action, log_prob = networks.sample(policy, key)
+        value = networks.twin(state.critic, x, action).min(0) - 0.5 * log_prob
+        return (3 * policy.mean**2).mean() - value.mean()
+
+    new = agent.improve_actor(state, x, x, key, lambda policy: (3 * policy.mean**2).mean())
+    near(new.actor, adams_first_step(state.actor, jax.grad(loss)(state.actor), 1e-3))
+
+
+@pytest.mark.parametrize("excess", [0.01, -0.01])
+def test_temperature_by_hand(excess: float) -> None:
+    """It rises where the batch's entropy is below the target, by however little, and falls where it is above."""
+    agent, state = started()
+    x, key = random_windows(SPEC).obs[:, 0], jax.random.key(4)
+    _, log_prob = networks.sample(agent.policy(state.actor, x), key)
+    new = agent.adjust_temperature(state, x, float(-log_prob.mean()) + excess, key)
+    change = new.log_temperature - state.log_temperature
+    np.testing.assert_allclose(change, 4e-3 * np.sign(excess), rtol=1e-3)
+
+
+def test_target_entropy_by_hand() -> None:
+    """-A for actions in [-1, 1]; in the task's units the half ranges, here with Σ log = 0.7, are added."""
+    windows = random_windows(SPEC)
+    assert dataclasses.replace(TINY_SAC, entropy_unit="scaled").target_entropy(windows) == -ACT
+    assert dataclasses.replace(TINY_SAC, entropy_unit="task").target_entropy(windows) == pytest.approx(-ACT - 0.7)
+
+
+def test_start() -> None:
+    """The target critics start as copies of two different critics, the temperature at its initial value."""
+    state = dataclasses.replace(TINY_SAC, initial_temperature=0.2).init(SPEC, jax.random.key(0))
+    assert same(state.target, state.critic)
+    assert not same(*state.critic)
+    np.testing.assert_allclose(jnp.exp(state.log_temperature), 0.2, rtol=1e-6)
+
+
+def test_it_explores_in_training_alone(rng: np.random.Generator) -> None:
+    agent, state = started()
+    what = seen(0, 0, rng)
+    policy = agent.policy(state.actor, what.obs)
+    key = jax.random.key(3)
+    np.testing.assert_array_equal(agent.act(state, what, key, explore=True), networks.sample(policy, key)[0])
+    np.testing.assert_array_equal(agent.act(state, what, key, explore=False), networks.mode(policy))
