@@ -170,7 +170,7 @@ def blocks() -> str:
     """Return a Markdown table of learning with several steps per call (benchmarks/updates-per-call.toml)."""
     if not (table := RESULTS / "updates-per-call.sqlite").exists():
         return ""
-    rows, cells, used = read_table(table)
+    rows, cells, used, _ = read_table(table)
     lines = head("task|`--updates-per-call`|mean of all evaluations|last evaluation|last, each seed|seed-steps/s")
     for cell, progress in cells:
         returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))

@@ -61,11 +61,14 @@ def test_round_trip(finished, tmp_path: Path) -> None:
     assert len(expected) == 2 * 2 * 2
     assert expected[0] | {"cell": grid.cells[0].id} == expected[0]
     assert collect(grid, runs, tmp_path / "mixed.sqlite") == len(expected)
-    rows, cells, used = read_table(tmp_path / "mixed.sqlite")
+    rows, cells, used, configs = read_table(tmp_path / "mixed.sqlite")
     assert rows == expected
     assert cells == standing(grid.cells, runs)
     assert used == versions_of(grid.cells, runs)
     assert used[0]["cores"]
+    assert [config["seed"] for config in configs] == [0, 1]
+    assert {row["configuration"] for row in rows} == {config["configuration"] for config in configs}
+    assert configs[0]["cost"] == {"parameters": 0, "gradient_steps": {}, "batches": [], "flops": 0.0}
     assert [(p.state, p.step) for _, p in cells] == [("done", 60), ("todo", 0)]
     assert [status(cell, runs) for cell in grid.cells] == ["done", "todo"]
 
@@ -106,7 +109,7 @@ def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> N
 )
 def test_committed_tables(table: str, grid: str | Path, count: int) -> None:
     """They open, and their cells are still those of their grids, ids included."""
-    rows, cells, _ = read_table(BENCHMARKS / "results" / f"{table}.sqlite")
+    rows, cells, *_ = read_table(BENCHMARKS / "results" / f"{table}.sqlite")
     assert [cell for cell, _ in cells] == list(load_grid(grid).cells)
     assert all((p.state, p.step) == ("done", cell.condition.steps) for cell, p in cells)
     assert len(rows) == count

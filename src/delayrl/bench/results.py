@@ -10,7 +10,7 @@ import json
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 from urllib.parse import quote
 
 from delayrl.bench import folders
@@ -20,7 +20,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.disk import draft
 from delayrl.run.folder import Run
-from delayrl.run.rows import EPISODE, Row, check_row
+from delayrl.run.rows import EPISODE, Row, check_row, name_configuration
 
 SCHEMA = 1
 TABLES = """
@@ -47,7 +47,7 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 
 
 def _read_rows(path: Path) -> list[Row]:
-    return [check_row(row, path) for row in Run(path).read("rows")]
+    return name_configuration([check_row(row, path) for row in Run(path).read("rows")])
 
 
 def collect(grid: Grid, runs: Path, out: Path) -> int:
@@ -109,11 +109,25 @@ def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, la
     return len(rows)
 
 
+class Collected(NamedTuple):
+    """What a table holds."""
+
+    rows: list[Row]  # as `rows_of` yields them
+    standing: list[tuple[Cell, Progress]]  # its cells, and how far each was
+    versions: list[dict[str, Any]]  # libraries, commits and hardware that the cells were trained with
+    configs: list[dict[str, Any]]  # the configuration of each run
+
+
 def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the versions, commits and hardware that cells were trained with, without duplicates."""
-    paths = [path for cell in cells for path in folders.seed_folders(runs / cell.folder, cell.seeds)]
-    first = [Run(path).config.get("versions") for path in paths if (path / "config.json").exists()]
+    first = [config.get("versions") for config in configs_of(cells, runs)]
     return _distinct([v for v in first if v] + [v for cell in cells for v in _journal_versions(runs / cell.folder)])
+
+
+def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
+    """Return the configurations of the runs that have begun."""
+    paths = [path for cell in cells for path in folders.seed_folders(runs / cell.folder, cell.seeds)]
+    return [Run(path).config for path in paths if (path / "config.json").exists()]
 
 
 def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -125,15 +139,8 @@ def _journal_versions(folder: Path) -> list[dict[str, Any]]:
     return [event["versions"] for event in folders.journal(folder) if "versions" in event]
 
 
-def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list[dict[str, Any]]]:
-    """Read a collected table.
-
-    Returns:
-        Its rows, as `rows_of` yields them; its cells with how far they were; the versions that they were trained with.
-
-    Raises:
-        DelayRLError: not a table of ours, a damaged one, or one with another schema version.
-    """
+def read_table(file: Path) -> Collected:
+    """Read a collected table. Raises DelayRLError if it is none of ours, damaged, or has another schema version."""
     with _open(file) as table:
         stored = table.execute("SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number")
         cells = [_stored_cell(*values) for values in stored]
@@ -144,7 +151,8 @@ def read_table(file: Path) -> tuple[list[Row], list[tuple[Cell, Progress]], list
             for run, more, *values in table.execute(f"SELECT run, more, {', '.join(EPISODE)} FROM rows")
         ]
         versions = [dict(v) for (text,) in table.execute("SELECT versions FROM runs") for v in json.loads(text)]
-    return rows, cells, _distinct(versions)
+        configs = [dict(json.loads(text)) for (text,) in table.execute("SELECT config FROM runs ORDER BY id")]
+    return Collected(rows, cells, _distinct(versions), configs)
 
 
 def _stored_cell(id: str, text: str, state: CellState, step: int, speed: float | None) -> tuple[Cell, Progress]:

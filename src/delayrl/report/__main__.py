@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from delayrl.errors import DelayRLError
+from delayrl.report.configurations import read_configs
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
 
@@ -16,7 +17,7 @@ def main() -> None:
     parser.add_argument("--title", default="delayrl", help="title of the report (default: delayrl)")
     given = parser.parse_args()
     try:
-        print(report(read_rows(given.rows), [], given.out, given.title))
+        print(report(read_rows(given.rows), [], given.out, given.title, configs=read_configs(given.rows)))
     except DelayRLError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -29,7 +29,8 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
         parts.append(f"## Protocol {protocol}, preset {preset}, {wording.seeds(results)}")
         for table in summary.tables:
             if table.setting == setting:
-                parts += [f"### {_escape(table.title)}", _paper_table(summary, table), wording.source(table)]
+                caption = _escape(wording.caption(table))
+                parts += [f"### {_escape(table.title)}", caption, _paper_table(summary, table), wording.source(table)]
         aggregates = [a for a in summary.aggregates if a.setting == setting]
         if aggregates:
             parts += ["### Interquartile mean of the normalised return over tasks", _aggregates(summary, aggregates)]
@@ -39,6 +40,9 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
             files = pictures.get((setting, kind), [])
             if files:
                 parts += [f"### {name}", *(f"![{name}](img/{file})" for file in files)]
+        if costs := wording.costs(summary, setting):
+            body = [[_escape(text) for text in line] for line in costs]
+            parts += ["### Cost of an agent", wording.COST_CAPTION, _table(wording.COST_HEAD, body)]
         parts += ["### Anchors", _anchors(results), "### All cells", _results(summary, results)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -58,10 +62,10 @@ def _paper_table(summary: Summary, table: Table) -> str:
     for env, delay in table.rows:
         line = [_escape(env), _escape(delay)]
         for column in table.columns:
-            ours, raw, note, theirs = wording.entry_texts(table, table.entries[env, delay, column])
-            grey = GREY.format(f"paper {theirs}") if theirs else ""
-            parts = (f"**{ours}**" if ours else "", f"raw {raw}" if raw else "", _escape(note), grey)
-            line.append("<br>".join(part for part in parts if part))
+            texts = wording.entry_texts(table, table.entries[env, delay, column])
+            shown = ("**{}**", "{}", "area {}", "raw {}", "{}", GREY.format("paper {}"))
+            parts = texts._replace(note=_escape(texts.note))
+            line.append("<br>".join(form.format(text) for form, text in zip(shown, parts, strict=True) if text))
         body.append(line)
     return _table(["Task", "Δ", *(_escape(summary.name(column)) for column in table.columns)], body)
 
@@ -89,7 +93,7 @@ def _anchors(results: Iterable[Result]) -> str:
     body = {}
     for r in results:
         anchors = (r.random_anchor, r.reference_anchor)
-        values = [f"{wording.number(a.value)} ({wording.count(a.runs, 'seed')})" if a.runs else "none" for a in anchors]
+        values = [wording.anchor(a) or "none" for a in anchors]
         key = r.place.env, r.condition.steps
         body[key] = (_escape(r.place.env), f"{r.condition.steps:,}", *values, _escape(r.reference_anchor.source))
     return _table(("Task", "Steps", "Random", "Ret_df", "Ret_df is the return of"), body.values())
@@ -100,7 +104,10 @@ def _results(summary: Summary, results: Iterable[Result]) -> str:
     for r in results:
         names = [_escape(text) for text in (r.place.env, r.place.delay, summary.name(r.place.label))]
         raw = wording.spread(*mean_std(r.curves.final))
-        normalised = wording.spread(*mean_std(r.normalise(r.curves.final)), wording.normalised)
+        normalised, area = (wording.spread(*mean_std(x), wording.normalised) for x in (r.final, r.area))
         seeds, state = f"{r.runs}/{r.seeds}", r.unfinished or r.progress.state
-        body.append((*names, raw, normalised, seeds, f"{r.condition.steps:,}", state))
-    return _table(("Task", "Δ", "Agent", "Return", "Normalised", "Seeds", "Steps", "State"), body)
+        final = "<br>".join(filter(None, (normalised, wording.interval(r.final_interval, wording.normalised))))
+        reached = "<br>".join(filter(None, (wording.reached(r), wording.interval(r.steps_interval, wording.steps))))
+        body.append((*names, raw, final, area, reached, seeds, f"{r.condition.steps:,}", state))
+    heads = ("Task", "Δ", "Agent", "Return", "Normalised", "Area", "Steps to Ret_df", "Seeds", "Steps", "State")
+    return _table(heads, body)

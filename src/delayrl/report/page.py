@@ -63,6 +63,9 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "results": [_result(r, names) for r in results],
         "anchors": [_anchors(r, names) for r in anchored.values()],
         "tables": [_table(t, names) for t in summary.tables],
+        "costs": [wording.costs(summary, s) for s in settings],
+        "costHead": wording.COST_HEAD,
+        "costCaption": wording.COST_CAPTION,
         "thresholds": _rounded(THRESHOLDS),
         "aggregates": [_aggregate(a, names) for a in summary.aggregates],
     }
@@ -98,8 +101,12 @@ def _result(r: Result, names: Names) -> dict[str, Any]:
         "seeds": r.seeds,
         "total": r.condition.steps,
         "raw": _rounded(mean_std(curves.final)),
-        "normalised": _rounded(mean_std(r.normalise(curves.final))),
-        "reached": [_rounded(r.steps_to_threshold), r.seeds_at_threshold],
+        "normalised": _rounded(mean_std(r.final)),
+        "interval": wording.interval(r.final_interval, wording.normalised),
+        "area": _rounded(mean_std(r.area)),
+        "reached": _rounded(r.steps_to_threshold),
+        "missed": r.missed,
+        "reachedInterval": wording.interval(r.steps_interval, wording.steps),
         "anchor": names["anchors"].index(_anchor_key(r)),
         "steps": curves.steps.tolist(),
         "mean": _rounded(curves.mean, 5) if r.runs else [],
@@ -115,7 +122,9 @@ def _anchor_key(r: Result) -> tuple[Setting, str, int]:
 def _anchors(r: Result, names: Names) -> dict[str, Any]:
     setting, task = names["settings"].index(r.place.setting), names["tasks"].index(r.place.env)
     anchors = {"random": r.random_anchor, "reference": r.reference_anchor}
-    values = {n: {"value": _rounded(a.value), "runs": a.runs, "source": a.source} for n, a in anchors.items()}
+    values = {
+        name: {"value": _rounded(a.value), "text": wording.anchor(a), "source": a.source} for name, a in anchors.items()
+    }
     return {"setting": setting, "task": task, "total": r.condition.steps, **values}
 
 
@@ -125,7 +134,8 @@ def _table(table: Table, names: Names) -> dict[str, Any]:
         entries = [table.entries[env, delay, column] for column in table.columns]
         texts = [[_rounded(e.value), e.partial, *wording.entry_texts(table, e)] for e in entries]
         rows.append([names["tasks"].index(env), names["delays"].index(delay), texts])
-    labels = {"kind": table.kind, "title": table.title, "source": wording.source(table)}
+    caption = " ".join(filter(None, (wording.caption(table), wording.source(table))))
+    labels = {"kind": table.kind, "title": table.title, "caption": caption}
     columns = [names["agents"].index(column) for column in table.columns]
     return labels | {"setting": names["settings"].index(table.setting), "columns": columns, "rows": rows}
 

@@ -18,6 +18,7 @@ def report(
     out: Path,
     title: str = "delayrl",
     versions: Sequence[Mapping[str, Any]] = (),
+    configs: Iterable[Mapping[str, Any]] = (),
 ) -> Path:
     """Write report.md, report.html and img/*.png, and return the path of the page.
 
@@ -27,11 +28,12 @@ def report(
         out: the folder.
         title: the heading.
         versions: libraries, commit and hardware that made the rows, as in a run's configuration.
+        configs: as for `summarise`; may be empty.
 
     Raises:
         DelayRLError: damaged or double rows, nothing to show, a folder that cannot be written.
     """
-    summary = summarise(rows, standing)
+    summary = summarise(rows, standing, configs)
     if not summary.results:
         raise DelayRLError("there is nothing to report: no cells and no rows")
     try:

@@ -1,8 +1,10 @@
 """Results: one for each condition, from the cells and rows of all its seeds, with the anchors of its task."""
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,9 +12,10 @@ from numpy.typing import NDArray
 
 from delayrl.report import statistics
 from delayrl.report.rows import RowGroup
-from delayrl.report.statistics import NAN, Floats
+from delayrl.report.statistics import NAN, Floats, Stratum
 from delayrl.run.cell import Cell, CellState, Progress, Standing
 from delayrl.run.condition import Condition
+from delayrl.run.cost import Cost
 
 PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
 """Columns of the paper's tables."""
@@ -36,18 +39,19 @@ class Curves(NamedTuple):
 
 
 class Anchor(NamedTuple):
-    """A return that others are measured by: its value (NaN if there is none), its number of runs and their agent.
+    """What others are measured by; without any runs, there is no such anchor."""
 
-    `inside`: the runs are of a reference inside another agent, because there is no delay-free SAC.
-    """
+    returns: Floats  # of each of its runs, [seeds]
+    smoothed: Floats  # the same, of the reference's smoothed curves: the threshold that learners are to reach
+    source: str = ""  # its agent
 
-    value: float = NAN
-    runs: int = 0
-    source: str = ""
-    inside: bool = False
+    @property
+    def value(self) -> float:
+        """The mean over its runs; NaN without any."""
+        return statistics.mean_std(self.returns)[0]
 
 
-NO_ANCHOR = Anchor()
+NO_ANCHOR = Anchor(np.zeros(0), np.zeros(0))
 
 
 class Setting(NamedTuple):
@@ -77,7 +81,7 @@ class Result:
     partial: bool  # no seed has reached its last step, so that the numbers are those of the steps so far
     privileged: bool  # whether its behaviour reads the true state while it trains
     curves: Curves  # of the complete seeds; where there is none yet, of all
-    reference: Curves  # the same of its delay-free reference, where it has one
+    cost: Cost | None = None  # of learning, where its runs say so
     random_anchor: Anchor = NO_ANCHOR  # its returns are normalised by this
     reference_anchor: Anchor = NO_ANCHOR  # and by this
 
@@ -106,16 +110,62 @@ class Result:
         return state if state == "running" else ""
 
     @property
+    def final(self) -> Floats:
+        """Normalised final returns, [runs]."""
+        return self.normalise(self.curves.final)
+
+    @cached_property
+    def final_interval(self) -> tuple[float, float]:
+        """95 % interval of their mean, with the anchors' uncertainty; NaN where it is unknown."""
+        if not self.runs or np.isnan(self.final).any() or self.is_anchor:
+            return NAN, NAN
+        low, high = statistics.stratified_bootstrap([self.stratum], lambda scores: scores.mean(-1))
+        return float(low), float(high)
+
+    @property
+    def stratum(self) -> Stratum:
+        """Its final returns with those of its anchors."""
+        return Stratum(self.random_anchor.returns, self.reference_anchor.returns, [self.curves.final])
+
+    @property
+    def area(self) -> Floats:
+        """Normalised area under the curve of each run, [runs]: its mean return over training."""
+        return self.normalise(statistics.area(*self.curves)) if self.runs else np.zeros(0)
+
+    @cached_property
+    def smoothed(self) -> Floats:
+        """Smoothed curves, [runs, N]."""
+        return statistics.smoothed(self.curves.returns)
+
+    @property
     def steps_to_threshold(self) -> float:
-        """The step at which the mean over the seeds first reaches Ret_df; NaN if it does not, or without Ret_df."""
+        """The step at which the smoothed mean over the seeds first reaches the reference's; NaN if it does not."""
         if not self.runs:
             return NAN
-        return float(statistics.steps_to_threshold(self.curves.steps, self.curves.mean, self.reference_anchor.value))
+        return float(statistics.steps_to_threshold(self.curves.steps, self.smoothed.mean(0), self.threshold))
+
+    @property
+    def threshold(self) -> float:
+        """The reference's smoothed return after its last step; NaN without a reference."""
+        return statistics.mean_std(self.reference_anchor.smoothed)[0]
+
+    @property
+    def missed(self) -> bool:
+        """Whether training has ended, and the threshold was not reached."""
+        ended = self.runs > 0 and not self.partial and not self.is_anchor and not math.isnan(self.threshold)
+        return ended and math.isnan(self.steps_to_threshold)
+
+    @cached_property
+    def steps_interval(self) -> tuple[float, float]:
+        """95 % interval of it, infinite where the threshold is not reached; NaN where it is unknown."""
+        if not self.runs or self.is_anchor:
+            return NAN, NAN
+        return statistics.bootstrap_steps(self.curves.steps, self.smoothed, self.reference_anchor.smoothed)
 
     @property
     def seeds_at_threshold(self) -> int:
-        """How many seeds reach Ret_df, each for itself."""
-        return int((self.curves.returns >= self.reference_anchor.value).any(-1).sum())
+        """How many smoothed curves of single seeds reach it."""
+        return int((self.smoothed >= self.threshold).any(-1).sum()) if self.runs else 0
 
 
 def agent_order(label: str) -> tuple[int, str]:
@@ -158,7 +208,6 @@ def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup]) 
     steps = max(cell.condition.steps for cell, _ in standing) or max((max(run) for run in runs.values()), default=0)
     complete = {seed for seed, run in runs.items() if max(run) >= steps}
     kept = complete or set(runs)
-    reference = {seed: run for group in groups for seed, run in group.runs("reference").items() if seed in kept}
     progress = [progress for _, progress in standing]
     state = _state({p.state for p in progress}, bool(runs))
     return Result(
@@ -169,7 +218,7 @@ def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup]) 
         not complete,
         any(group.privileged for group in groups),
         Curves(*statistics.common_steps([runs[seed] for seed in sorted(kept)])),
-        Curves(*statistics.common_steps([reference[seed] for seed in sorted(reference)])),
+        next((group.cost for group in groups if group.cost), None),
     )
 
 
@@ -183,26 +232,20 @@ def _state(states: set[CellState], has_rows: bool) -> CellState:
 
 
 def _anchored(result: Result, others: Sequence[Result]) -> Result:
-    """With the anchors of its task: same protocol and preset; the reference has trained for as many steps."""
+    """With the anchors of its task: same protocol and preset; delay-free SAC has trained for as many steps."""
     setting, env = result.place.setting, result.place.env
     near = [o for o in others if o.place.setting.protocol == setting.protocol and o.place.env == env and o.runs]
     random = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
     ended = [o for o in near if o.place.setting == setting and not o.partial]
     trained = [o for o in ended if o.condition.steps == result.condition.steps]
     plain = [o for o in trained if o.condition.agent == "sac" and o.place.delay == 0]
-    inside = [o for o in trained if o.reference.steps.size]
     random_anchor = reference_anchor = NO_ANCHOR
     if random:  # it does not learn, so that all its evaluations are alike
         best = min(random, key=_fewest_overrides)
-        random_anchor = Anchor(float(best.curves.returns.mean()), best.runs, "random")
+        random_anchor = Anchor(best.curves.returns.mean(1), best.smoothed[:, -1], "random")
     if plain:
         best = min(plain, key=_fewest_overrides)
-        reference_anchor = Anchor(float(best.curves.final.mean()), best.runs, f"{best.place.label}, no delay")
-    elif inside:
-        first = ("vdpo", "lifting")
-        best = min(inside, key=lambda o: ([o.condition.agent != name for name in first], _fewest_overrides(o)))
-        source, final = f"the reference inside {best.place.label}, Δ={best.place.delay}", best.reference.final
-        reference_anchor = Anchor(float(final.mean()), final.size, source, True)
+        reference_anchor = Anchor(best.curves.final, best.smoothed[:, -1], f"{best.place.label}, no delay")
     return replace(result, random_anchor=random_anchor, reference_anchor=reference_anchor)
 
 

@@ -11,9 +11,14 @@ from typing import Any
 
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
-from delayrl.run.rows import CONDITION, Row
+from delayrl.run.cost import Cost
+from delayrl.run.rows import CONDITION, CONFIGURATION, Row, name_configuration
 
 LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
+
+
+Key = tuple[Any, ...]
+"""The columns of a condition, then the hash of its options, which is None in rows of version 0.1."""
 
 
 @dataclass(slots=True)
@@ -26,14 +31,26 @@ class Evaluation:
 
 @dataclass
 class RowGroup:
-    """The rows that name the same cell and the same condition."""
+    """The rows that name the same cell, condition and configuration."""
 
     cell: str | None  # its id; None if the rows name no cell
     condition: Condition  # without overrides and steps, which rows do not name
+    configuration: str | None  # the hash of its options; None if the rows name none
     privileged: bool  # whether the agent's behaviour reads the true state while it trains
+    config: Mapping[str, Any] = field(default_factory=dict)  # of its runs, where it is known
     curves: dict[tuple[str, int], dict[int, Evaluation]] = field(
         default_factory=lambda: defaultdict(lambda: defaultdict(Evaluation))
     )
+
+    @property
+    def key(self) -> Key:
+        """What was trained, as the rows name it."""
+        return *self.condition.columns.values(), self.configuration
+
+    @property
+    def cost(self) -> Cost | None:
+        """What its learning costs, where that is known."""
+        return Cost.from_json(self.config["cost"]) if "cost" in self.config else None
 
     @property
     def rows(self) -> int:
@@ -56,7 +73,7 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
     for number, row in enumerate(rows, 1):
         try:
             *condition, seed, step, policy, episode, value = columns(row)
-            key = (row.get("cell"), *condition)
+            key = (row.get("cell"), row.get(CONFIGURATION), *condition)
             if not (type(seed) is type(step) is type(episode) is int and 0 <= step < LIMIT and episode >= 0):
                 raise TypeError
             if not math.isfinite(value):
@@ -80,8 +97,8 @@ def _group(row: Mapping[str, Any]) -> RowGroup:
     condition = Condition.from_json({name: row[name] for name in CONDITION} | {"overrides": {}, "steps": 0})
     if isinstance(condition.delay, bool) or (isinstance(condition.delay, int) and abs(condition.delay) >= 2**31):
         raise ValueError
-    cell = row.get("cell")
-    return RowGroup(None if cell is None else str(cell), condition, row.get("privileged") is True)
+    cell, configuration = (None if row.get(name) is None else str(row[name]) for name in ("cell", CONFIGURATION))
+    return RowGroup(cell, condition, configuration, row.get("privileged") is True)
 
 
 def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
@@ -91,6 +108,7 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
     """
     for path in paths:
         configs: dict[Any, Row] = {}
+        runs: dict[Any, list[Row]] = defaultdict(list)
         try:
             with open(path, "rb") as file:
                 for number, line in enumerate(file, 1):
@@ -99,11 +117,13 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
                         if not isinstance(row, dict):
                             raise TypeError
                         if "config" in row:
-                            names = (*CONDITION, "privileged", "seed")
+                            names = [*CONDITION, "privileged", "seed", *({CONFIGURATION} & row["config"].keys())]
                             configs[row["run"]] = {name: row["config"][name] for name in names}
                         elif "step" in row:
-                            yield configs.get(row.get("run"), {}) | row
-                    except (ValueError, TypeError, KeyError, RecursionError):
+                            runs[row.get("run")].append(configs.get(row.get("run"), {}) | row)
+                    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
                         raise DelayRLError(f"{path}, line {number}: this is no row of results") from None
         except OSError as error:
             raise DelayRLError(f"{path} cannot be read: {error.strerror}") from error
+        for rows in runs.values():
+            yield from name_configuration(rows)

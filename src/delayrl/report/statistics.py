@@ -1,18 +1,32 @@
 """Statistics of many runs, as functions on arrays (NumPy alone).
 
-A *score* is one number for each run. Scores of several tasks are a list of arrays, one for each task: *strata*. Runs
-of different tasks are never exchanged for each other when uncertainty is estimated. Method: Agarwal et al., "Deep
-reinforcement learning at the edge of the statistical precipice", NeurIPS 2021.
+A *score* is one number for each run: its normalised return. Runs of different tasks are never exchanged for each other
+when uncertainty is estimated: they are different *strata*. Method: Agarwal et al., "Deep reinforcement learning at the
+edge of the statistical precipice", NeurIPS 2021. The anchors that a return is normalised by are runs too, and are
+resampled with the others.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 NAN = math.nan
+SMOOTHED = 5
+"""Evaluations that a smoothed curve averages."""
+REPETITIONS = 2000
+PERCENTILES = (2.5, 97.5)
+
+
+class Stratum(NamedTuple):
+    """Runs of one task: returns of its anchors, [seeds], and of each condition that is normalised by them, [runs]."""
+
+    random: Floats
+    reference: Floats
+    returns: Sequence[Floats]
 
 
 def mean_std(values: ArrayLike) -> tuple[float, float]:
@@ -27,12 +41,27 @@ def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
     return (x - random) / (reference - random) if reference > random else np.full(x.shape, NAN)
 
 
-def steps_to_threshold(steps: ArrayLike, returns: ArrayLike, threshold: float) -> Floats:
+def steps_to_threshold(steps: ArrayLike, returns: ArrayLike, threshold: ArrayLike) -> Floats:
     """Return the first of the steps, [N], at which each curve, [..., N], reaches the threshold; NaN if none does."""
     steps, reached = np.asarray(steps, float), np.asarray(returns, float) >= threshold
     if not steps.size:
         return np.full(reached.shape[:-1], NAN)
     return np.where(reached.any(-1), steps[reached.argmax(-1)], NAN)
+
+
+def smoothed(returns: ArrayLike) -> Floats:
+    """Average each evaluation of curves, [..., N], with the SMOOTHED - 1 before it, or as many as there are."""
+    x = np.asarray(returns, float)
+    return np.stack([x[..., max(0, n - SMOOTHED) : n].mean(-1) for n in range(1, x.shape[-1] + 1)], -1)
+
+
+def area(steps: ArrayLike, returns: ArrayLike) -> Floats:
+    """Return the area under curves, [..., N], divided by the last of the steps, [N]: the mean return over training.
+
+    Each evaluation stands for the steps since the one before it.
+    """
+    lengths = np.diff(np.asarray(steps, float), prepend=0)
+    return np.asarray(returns, float) @ lengths / lengths.sum()
 
 
 def interquartile_mean(scores: ArrayLike) -> Floats:
@@ -43,27 +72,65 @@ def interquartile_mean(scores: ArrayLike) -> Floats:
 
 
 def stratified_bootstrap(
-    strata: Sequence[ArrayLike], statistic: Callable[[Floats], Floats], repetitions: int = 2000, seed: int = 0
+    strata: Sequence[Stratum], statistic: Callable[[Floats], Floats], repetitions: int = REPETITIONS, seed: int = 0
 ) -> tuple[Floats, Floats]:
-    """Estimate the 95 % percentile interval of a statistic of pooled scores, resampling runs within their stratum.
+    """Estimate the 95 % percentile interval of a statistic of pooled scores.
+
+    Resamples runs within their condition, and the runs of the anchors, whose means then normalise all conditions of
+    their stratum.
 
     Args:
-        strata: scores of each task, at least one in each.
+        strata: one for each task, with at least one run in each of its arrays.
         statistic: of scores [repetitions, runs], along the last axis; returns [repetitions, ...].
         repetitions: how many resamples.
-        seed: the same scores and seed give the same interval.
+        seed: the same returns and seed give the same interval.
 
     Returns:
-        Lower and upper bound; NaN where a stratum has fewer than two runs, because their spread is then unknown.
+        Lower and upper bound. NaN where a condition or an anchor has fewer than two runs, because their spread is then
+        unknown, and where the reference is no better than random in a resample.
     """
-    arrays = [np.asarray(scores, float) for scores in strata]
     random = np.random.default_rng(seed)
-    drawn = [x[random.integers(x.size, size=(repetitions, x.size))] for x in arrays]
-    values = statistic(np.concatenate(drawn, axis=-1))
-    tail = 50 * (1 - 0.95)
-    low, high = np.percentile(values, [tail, 100 - tail], axis=0)
-    known = min(x.size for x in arrays) > 1
+    scores, known = [], True
+    for stratum in strata:
+        low, high = (_resample(random, x, repetitions).mean(1, keepdims=True) for x in stratum[:2])
+        scores += [
+            (_resample(random, x, repetitions) - low) / np.where(high > low, high - low, 1) for x in stratum.returns
+        ]
+        sizes = [x.size for x in (stratum.random, stratum.reference, *stratum.returns)]
+        known = known and min(sizes) > 1 and bool((high > low).all())
+    low, high = np.percentile(statistic(np.concatenate(scores, axis=-1)), PERCENTILES, axis=0)
     return (low, high) if known else (np.full_like(low, NAN), np.full_like(high, NAN))
+
+
+def bootstrap_steps(
+    steps: ArrayLike, curves: Floats, reference: Floats, repetitions: int = REPETITIONS, seed: int = 0
+) -> tuple[float, float]:
+    """Estimate the 95 % percentile interval of the step at which the mean of curves reaches the mean of a reference.
+
+    Args:
+        steps: of the evaluations, [N].
+        curves: [runs, N], resampled by runs.
+        reference: returns of the reference's runs, [seeds], resampled too.
+        repetitions: how many resamples.
+        seed: the same curves and seed give the same interval.
+
+    Returns:
+        Lower and upper bound, each one of the steps, or infinite where the curve does not reach the reference. NaN with
+        fewer than two runs or seeds.
+    """
+    if min(len(curves), len(reference)) < 2:
+        return NAN, NAN
+    random = np.random.default_rng(seed)
+    means = _resample(random, curves, repetitions).mean(1)
+    thresholds = _resample(random, reference, repetitions).mean(1, keepdims=True)
+    reached = np.nan_to_num(steps_to_threshold(steps, means, thresholds), nan=math.inf)
+    low, high = np.percentile(reached, PERCENTILES, method="inverted_cdf")  # which interpolates nothing
+    return float(low), float(high)
+
+
+def _resample(random: np.random.Generator, values: Floats, repetitions: int) -> Floats:
+    """Draw as many of the values, along the first axis, as there are, with replacement: [repetitions, ...]."""
+    return values[random.integers(len(values), size=(repetitions, len(values)))]
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:

@@ -1,7 +1,7 @@
 """All that a report shows, computed from rows and cells. Cells are inferred where no grid names them."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -9,9 +9,10 @@ import numpy as np
 
 from delayrl.errors import DelayRLError
 from delayrl.report import statistics
+from delayrl.report.configurations import by_key, distinct_overrides
 from delayrl.report.results import Place, Result, Setting, agent_order, delay_order, make_results
 from delayrl.report.rows import RowGroup, group_rows
-from delayrl.report.statistics import Floats
+from delayrl.report.statistics import Floats, Stratum
 from delayrl.report.tables import Table, make_tables
 from delayrl.run.cell import Cell, Progress, Standing
 
@@ -61,55 +62,68 @@ class Summary:
         return f"{label} †" if marked else label
 
 
-def summarise(rows: Iterable[Mapping[str, Any]], standing: Standing = ()) -> Summary:
+def summarise(
+    rows: Iterable[Mapping[str, Any]], standing: Standing = (), configs: Iterable[Mapping[str, Any]] = ()
+) -> Summary:
     """Compute results, tables and aggregates.
 
     Args:
         rows: as in a run's rows.jsonl, in any order, read once. Column "cell" names the cell.
         standing: the cells of a grid, run or not, and how far they are. If empty, the cells are inferred from the rows.
+        configs: the configurations of runs, as config.json holds them. They say what a learner costs, and what tells
+            inferred cells apart.
 
     Raises:
         DelayRLError: a row lacks a column, holds a value of another type, or is there twice; the rows of a cell are
             of several conditions.
     """
-    groups = group_rows(rows)
-    standing = standing or _infer_cells(groups)
-    cells = [cell for cell, _ in standing]
-    group_of, unplaced = _assign_groups(groups, cells)
-    labels, shared = _label_cells(cells)
+    groups, known = group_rows(rows), by_key(configs)
+    for group in groups:
+        group.config = known.get(group.key, {})
+    if standing:
+        unplaced, placed = _place_groups(groups, [cell for cell, _ in standing])
+    else:
+        unplaced, (standing, placed) = 0, _infer_cells([group for group in groups if group.runs("agent")])
+    group_of: dict[str, RowGroup] = {}
+    for id, group in placed:
+        if group_of.setdefault(id, group) is not group:
+            raise DelayRLError(f"the rows of cell {id} are of different things: {group_of[id].key} and {group.key}")
+    labels, shared = _label_cells([cell for cell, _ in standing])
     results = make_results(standing, group_of, labels)
     return Summary(results, shared, make_tables(results), _make_aggregates(results.values()), unplaced)
 
 
-def _infer_cells(groups: Iterable[RowGroup]) -> Standing:
-    """Make a cell of each group of rows. Its last step is taken for the step at which training ends."""
-    standing = []
-    for group in groups:
+Placed = list[tuple[str, RowGroup]]
+"""The id of a cell, with rows of it."""
+
+
+def _infer_cells(groups: Sequence[RowGroup]) -> tuple[Standing, Placed]:
+    """Make a cell of each group of rows. It ends at the last of its steps, or at a later one that its runs name."""
+    standing, placed = [], []
+    for group, overrides in zip(groups, distinct_overrides(groups), strict=True):
         runs = group.runs("agent")
-        if runs:
-            steps = [max(run) for run in runs.values()]
-            id = repr((None, *group.condition.columns.values())) if group.cell is None else group.cell
-            cell = Cell(replace(group.condition, steps=max(steps)), tuple(sorted(runs)), id)
-            standing.append((cell, Progress("done" if min(steps) == max(steps) else "running", min(steps))))
-    return standing
+        steps = [max(run) for run in runs.values()]
+        end = max(*steps, group.config["schedule"]["steps"] if group.config else 0)
+        id = repr((None, *group.key)) if group.cell is None else group.cell
+        cell = Cell(replace(group.condition, steps=end, overrides=overrides), tuple(sorted(runs)), id)
+        standing.append((cell, Progress("done" if min(steps) == end else "running", min(steps))))
+        placed.append((id, group))
+    return standing, placed
 
 
-def _assign_groups(groups: Iterable[RowGroup], cells: Iterable[Cell]) -> tuple[dict[str, RowGroup], int]:
-    """Find the rows of each cell that has some, by its id, and how many rows belong to no cell."""
-    group_of: dict[str, RowGroup] = {}
+def _place_groups(groups: Iterable[RowGroup], cells: Iterable[Cell]) -> tuple[int, Placed]:
+    """Find the rows of each cell, by its id or its condition; return first how many rows belong to no cell."""
     ids_of: dict[tuple[Any, ...], list[str]] = defaultdict(list)
     for cell in cells:
         ids_of[tuple(cell.condition.columns.values())].append(cell.id)
-    known, unplaced = {id for ids in ids_of.values() for id in ids}, 0
+    known, unplaced, placed = {id for ids in ids_of.values() for id in ids}, 0, []
     for group in groups:
-        columns = tuple(group.condition.columns.values())
-        ids = ids_of[columns] if group.cell is None else [group.cell]
-        if len(ids) != 1 or ids[0] not in known:
+        ids = ids_of[tuple(group.condition.columns.values())] if group.cell is None else [group.cell]
+        if len(ids) == 1 and ids[0] in known:
+            placed.append((ids[0], group))
+        else:
             unplaced += group.rows
-        elif group_of.setdefault(ids[0], group) is not group:
-            first = tuple(group_of[ids[0]].condition.columns.values())
-            raise DelayRLError(f"the rows of cell {ids[0]} are of different things: {first} and {columns}")
-    return group_of, unplaced
+    return unplaced, placed
 
 
 def _label_cells(cells: Iterable[Cell]) -> tuple[dict[str, str], dict[str, Mapping[str, Any]]]:
@@ -132,26 +146,35 @@ def _label_cells(cells: Iterable[Cell]) -> tuple[dict[str, str], dict[str, Mappi
 
 def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
     """Aggregate the results of learners whose seeds have ended and whose task has both anchors."""
-    strata: dict[tuple[Setting, int | str | None, str], list[Floats]] = defaultdict(list)
+    chosen: dict[tuple[Setting, int | str | None, str], list[Result]] = defaultdict(list)
     for result in results:
-        place, scores = result.place, result.normalise(result.curves.final)
-        if result.is_anchor or result.partial or not scores.size or np.isnan(scores).any():
+        place = result.place
+        if result.is_anchor or result.partial or not result.runs or np.isnan(result.final).any():
             continue
-        strata[place.setting, place.delay, place.label].append(scores)
+        chosen[place.setting, place.delay, place.label].append(result)
         if isinstance(place.delay, int):
-            strata[place.setting, None, place.label].append(scores)
-    delays = Counter(setting for setting, delay in {key[:2] for key in strata} if isinstance(delay, int))
-    chosen = [key for key in strata if key[1] is not None or delays[key[0]] > 1]
-    return sorted((_aggregate(*key, strata[key]) for key in chosen), key=_order)
+            chosen[place.setting, None, place.label].append(result)
+    delays = Counter(setting for setting, delay in {key[:2] for key in chosen} if isinstance(delay, int))
+    keys = [key for key in chosen if key[1] is not None or delays[key[0]] > 1]
+    return sorted((_aggregate(*key, chosen[key]) for key in keys), key=_order)
 
 
-def _aggregate(setting: Setting, delay: int | str | None, label: str, scores: list[Floats]) -> Aggregate:
-    pooled = np.concatenate(scores)
+def _aggregate(setting: Setting, delay: int | str | None, label: str, results: list[Result]) -> Aggregate:
+    pooled = np.concatenate([result.final for result in results])
+    strata = _strata(results)
     iqm = float(statistics.interquartile_mean(pooled))
-    low, high = statistics.stratified_bootstrap(scores, statistics.interquartile_mean)
+    low, high = statistics.stratified_bootstrap(strata, statistics.interquartile_mean)
     profile = statistics.performance_profile(pooled, THRESHOLDS)
-    band = statistics.stratified_bootstrap(scores, lambda x: statistics.performance_profile(x, THRESHOLDS), 500)
-    return Aggregate(setting, delay, label, iqm, float(low), float(high), len(scores), pooled.size, profile, *band)
+    band = statistics.stratified_bootstrap(strata, lambda x: statistics.performance_profile(x, THRESHOLDS), 500)
+    return Aggregate(setting, delay, label, iqm, float(low), float(high), len(results), pooled.size, profile, *band)
+
+
+def _strata(results: Iterable[Result]) -> list[Stratum]:
+    """Put results that share their anchors into one stratum: those of one task and length."""
+    strata: dict[tuple[str, int], list[Stratum]] = defaultdict(list)
+    for result in results:
+        strata[result.place.env, result.condition.steps].append(result.stratum)
+    return [Stratum(*some[0][:2], [x for one in some for x in one.returns]) for some in strata.values()]
 
 
 def _order(aggregate: Aggregate) -> tuple[Any, ...]:

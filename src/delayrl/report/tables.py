@@ -1,7 +1,6 @@
 """Tables in the paper's layout: which rows and columns, and what stands in them."""
 
 import csv
-import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,6 +44,9 @@ class TableEntry(NamedTuple):
 
     value: float = NAN  # a normalised return, or a number of steps
     std: float = NAN
+    interval: tuple[float, float] = (NAN, NAN)  # of the value, 95 %; infinite where the threshold is not reached
+    area: float = NAN  # the normalised mean return over training
+    area_std: float = NAN
     raw: float = NAN  # the raw return beside it
     raw_std: float = NAN
     missed: bool = False  # training has ended and the threshold was not reached
@@ -118,17 +120,16 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) 
         return TableEntry(published=published)
     raw, raw_std = statistics.mean_std(result.curves.final)
     notes = [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
-    missed = False
+    area = area_std = NAN
     if kind == "steps":
-        value, std = result.steps_to_threshold, NAN
-        ended = result.runs > 0 and not result.partial and not math.isnan(result.reference_anchor.value)
-        missed = ended and math.isnan(value)
+        value, std, interval = result.steps_to_threshold, NAN, result.steps_interval
         if result.seeds_at_threshold:
             notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds")
     else:
-        value, std = statistics.mean_std(result.normalise(result.curves.final))
-    if result.reference_anchor.inside and result.runs:
-        notes.append(f"Ret_df: {result.reference_anchor.source}")
+        value, std = statistics.mean_std(result.final)
+        interval, (area, area_std) = result.final_interval, statistics.mean_std(result.area)
     if result.unfinished:
         notes.append(result.unfinished)
-    return TableEntry(value, std, raw, raw_std, missed, result.partial, " · ".join(notes), published)
+    note = " · ".join(notes)
+    missed = kind == "steps" and result.missed
+    return TableEntry(value, std, interval, area, area_std, raw, raw_std, missed, result.partial, note, published)

@@ -3,11 +3,13 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from delayrl.report.results import Result
+from delayrl.report.results import Anchor, Result, Setting, agent_order
+from delayrl.report.statistics import SMOOTHED, mean_std
 from delayrl.report.summary import Summary
 from delayrl.report.tables import Table, TableEntry
+from delayrl.run.cost import Cost
 
 PAPER = (
     "Paper: Wu et al., Variational Delayed Policy Optimization, NeurIPS 2024; 10 seeds, 1,000,000 steps. It states no "
@@ -38,18 +40,108 @@ def spread(value: float, std: float, write: Callable[[float, float], str] = numb
     return "" if math.isnan(value) else write(value, value) + ("" if math.isnan(std) else f" ± {write(std, value)}")
 
 
+def anchor(anchor: Anchor) -> str:
+    """Write an anchor's value with its spread and number of seeds; empty if there is none."""
+    seeds = count(anchor.returns.size, "seed")
+    return f"{spread(*mean_std(anchor.returns))} ({seeds})" if anchor.returns.size else ""
+
+
+def reached(result: Result) -> str:
+    """Write the steps to the threshold, × if it was missed."""
+    return "×" if result.missed else steps(result.steps_to_threshold)
+
+
+def interval(bounds: tuple[float, float], write: Callable[[float], str]) -> str:
+    """Write a 95 % interval, with × for a threshold that is not reached; empty if it is unknown, or reaches nothing."""
+    low, high = bounds
+    if math.isnan(low) or math.isinf(low):
+        return ""
+    return f"{write(low)} to {'×' if math.isinf(high) else write(high)}"
+
+
 def count(number: int, noun: str) -> str:
     """Write a number of things, in the plural unless there is one."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def entry_texts(table: Table, entry: TableEntry) -> tuple[str, str, str, str]:
-    """Write our value, the raw return, the note and the paper's value."""
+class EntryTexts(NamedTuple):
+    """The lines of a table's entry; empty where there is nothing to say."""
+
+    ours: str
+    interval: str
+    area: str
+    raw: str
+    note: str
+    theirs: str
+
+
+def entry_texts(table: Table, entry: TableEntry) -> EntryTexts:
+    """Write our value, its interval, the area under the curve, the raw return, the note and the paper's value."""
     write = steps if table.kind == "steps" else normalised
     ours = "×" if entry.missed else spread(entry.value, entry.std, write)
+    area = spread(entry.area, entry.area_std, normalised)
     published = entry.published
     theirs = "" if published is None else spread(published.value, published.std, write) or "×"
-    return ours, spread(entry.raw, entry.raw_std), entry.note, theirs
+    raw = spread(entry.raw, entry.raw_std)
+    return EntryTexts(ours, interval(entry.interval, write), area, raw, entry.note, theirs)
+
+
+def caption(table: Table) -> str:
+    """Say what stands in a table's entries."""
+    if table.kind == "steps":
+        return (
+            "First evaluation at which the mean over seeds reaches that of delay-free SAC after training (×: none), "
+            f"both averaged over the last {SMOOTHED} evaluations; its 95 % interval; how many seeds reach it. "
+            "Raw: return after the last step."
+        )
+    return (
+        "Final return, mean ± standard deviation over seeds; 95 % interval of the mean, with the anchors' uncertainty. "
+        "Area: normalised mean return over training. Raw: return after the last step."
+    )
+
+
+COST_HEAD = ("Agent", "Reads the true state", "Parameters", "Gradient steps", "Batch", "FLOP")
+COST_CAPTION = (
+    "Of one seed, per environment step from the first update on: steps of each optimiser, and multiplications and "
+    "additions of the updates' matrix products. Ranges are over tasks and delays."
+)
+
+
+def costs(summary: Summary, setting: Setting) -> Sequence[tuple[str, ...]]:
+    """Write a line for each agent that learns and whose cost is known, in the columns of COST_HEAD."""
+    known: dict[str, list[Result]] = {}
+    for place, result in summary.results.items():
+        if place.setting == setting and result.cost and result.cost.batches:
+            known.setdefault(place.label, []).append(result)
+    lines = []
+    for label in sorted(known, key=agent_order):
+        costs = [result.cost for result in known[label] if result.cost]
+        steps = " or ".join(dict.fromkeys(_gradient_steps(cost) for cost in costs))
+        batches = " or ".join(dict.fromkeys(", ".join(map(str, cost.batches)) for cost in costs))
+        sizes = _range([cost.parameters for cost in costs]), _range([cost.flops for cost in costs])
+        privileged = "in training" if any(result.privileged for result in known[label]) else "no"
+        lines.append((summary.name(label), privileged, sizes[0], steps, batches, sizes[1]))
+    return lines
+
+
+def _gradient_steps(cost: Cost) -> str:
+    """Write how often each optimiser steps; those that step alike are together."""
+    names: dict[float, list[str]] = {}
+    for name, number in cost.gradient_steps.items():
+        names.setdefault(number, []).append(name)
+    return "; ".join(f"{number:g} {', '.join(alike)}" for number, alike in sorted(names.items(), reverse=True))
+
+
+def _range(values: Sequence[float]) -> str:
+    if any(math.isnan(value) for value in values):
+        return "unknown"
+    return " to ".join(dict.fromkeys(_short(value) for value in (min(values), max(values))))
+
+
+def _short(value: float) -> str:
+    """Write a large number with three digits and k, M, G or T."""
+    power = min(4, int(math.log10(value)) // 3) if value >= 1 else 0
+    return f"{float(f'{value / 1000**power:.3g}'):g}{('', 'k', 'M', 'G', 'T')[power]}"
 
 
 def source(table: Table) -> str:

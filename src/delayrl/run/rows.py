@@ -1,6 +1,7 @@
 """Rows: one for each evaluation episode, as a run folder's rows.jsonl holds them."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from delayrl.errors import DelayRLError
@@ -9,6 +10,8 @@ Row = dict[str, Any]
 CONDITION: dict[str, Any] = {"agent": str, "env": str, "delay": int | str, "preset": str, "protocol": str}
 """The columns that describe a row's condition, with their types."""
 NUMBERS = {"episode": int, "reset_seed": int, "return": float, "length": int}
+CONFIGURATION = "configuration"
+"""The column with the hash of a run's options. Rows of version 0.1 have none."""
 EPISODE: dict[str, type] = {"step": int, "policy": str, **NUMBERS}
 """The columns that differ between the rows of a run, with their types."""
 
@@ -19,3 +22,9 @@ def check_row(row: Any, where: object) -> Row:
     if not typed or not math.isfinite(row["return"]):
         raise DelayRLError(f"{where} holds a damaged row: {str(row)[:200]}")
     return row
+
+
+def name_configuration(rows: Sequence[Row]) -> list[Row]:
+    """Give all rows of a run the configuration that its last row names: an older version may have begun the run."""
+    newest = rows[-1].get(CONFIGURATION) if rows else None
+    return [row if newest is None else {CONFIGURATION: newest} | row for row in rows]

@@ -1,0 +1,69 @@
+"""What the configurations of runs add to their rows: hyperparameters that differ from the preset's, and the cost."""
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from delayrl.agents.registry import find_agent
+from delayrl.errors import DelayRLError
+from delayrl.report.rows import Key, RowGroup
+from delayrl.run.condition import Condition
+from delayrl.run.configuration import override, values_of
+from delayrl.run.folder import Run
+
+Config = Mapping[str, Any]
+"""What a run's config.json holds."""
+
+
+def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
+    """Yield the configurations beside rows.jsonl files, and those in files that `benchmarks/collect.py` wrote."""
+    for path in paths:
+        if (path.parent / "config.json").is_file():
+            yield Run(path.parent).config
+            continue
+        try:
+            lines = [line for line in path.read_bytes().splitlines() if b'"config"' in line]
+            yield from (line["config"] for line in map(json.loads, lines) if "config" in line)
+        except (OSError, ValueError, TypeError) as error:
+            raise DelayRLError(f"{path} cannot be read: {error}") from error
+
+
+def by_key(configs: Iterable[Config]) -> dict[Key, Config]:
+    """Return configurations by the columns of their rows, without those of version 0.1, which rows do not name."""
+    known: dict[Key, Config] = {}
+    for config in configs:
+        if "configuration" in config:
+            condition = Condition.from_json({"overrides": {}, "steps": 0, **config})
+            known[*condition.columns.values(), config["configuration"]] = config
+    return known
+
+
+def distinct_overrides(groups: Sequence[RowGroup]) -> list[dict[str, Any]]:
+    """Return overrides that tell groups of different configurations apart: by what differs, or else by the hash."""
+    overrides = [overrides_of(group.config) for group in groups]
+    alike: dict[str, set[str | None]] = defaultdict(set)
+    names = []
+    for group, own in zip(groups, overrides, strict=True):
+        c = group.condition
+        names.append(json.dumps([c.agent, c.preset, c.protocol, own], sort_keys=True))
+        alike[names[-1]].add(group.configuration)
+    return [
+        own | {"configuration": group.configuration[:8]} if group.configuration and len(alike[name]) > 1 else own
+        for group, own, name in zip(groups, overrides, names, strict=True)
+    ]
+
+
+def overrides_of(config: Config) -> dict[str, Any]:
+    """Return the options of a configuration that differ from its preset's; none if we do not know the preset."""
+    try:
+        agent = find_agent(config["agent"])
+        preset, protocol = agent.presets[config["preset"]], agent.protocol(config["protocol"])
+    except (KeyError, DelayRLError):
+        return {}
+    base: dict[str, Any] = {}
+    for part in (preset.agent, preset.schedule):
+        base |= values_of(override(part, protocol.overrides))
+    options = config["hyperparameters"] | config["schedule"]
+    return {name: value for name, value in options.items() if name not in base or base[name] != value}
