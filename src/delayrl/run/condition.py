@@ -98,7 +98,8 @@ class Setup:
     @property
     def configuration(self) -> str:
         """Return a hash of all options. With their other columns, it tells rows what was trained, but for the seed."""
-        return _digest({name: self._decisive[name] for name in ("hyperparameters", "schedule")})
+        options = ("hyperparameters", "schedule", "habits")
+        return _digest({name: value for name, value in self._decisive.items() if name in options})
 
     @property
     def _decisive(self) -> dict[str, Any]:
