@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import learned, record
-from delayrl.agents.adsac import ADSAC, State
+from delayrl.agents.adsac import ADSAC, State, augmented_learner, with_augmented
 from delayrl.agents.sac import SAC
 from delayrl.core import networks
 from delayrl.core import replay as ring
@@ -141,6 +141,25 @@ def test_equal_delays_are_a_sac() -> None:
     assert same(long.auxiliary, auxiliary)
     near((long.actor, long.actor_opt_state), (expected.actor, expected.actor_opt_state))
     assert same((long.actor, long.actor_opt_state), (short.auxiliary.actor, short.auxiliary.actor_opt_state))
+
+
+def test_a_round_is_its_parts() -> None:
+    """The coin, the actor and both temperatures have keys of their own; the temperatures follow their own actors."""
+    agent, state = started(actor_updates=1)
+    now = agent.inputs(windows_of(), 0)
+    improve = [jax.jit(lambda s, k, f=f: f(s, now, k)) for f in (agent.improve_augmented, agent.improve_auxiliary)]
+    adjust = jax.jit(lambda learner, x, key: agent.learner.adjust_temperature(learner, x, -1.5, key))
+    whole = jax.jit(lambda key: agent._improve(state, now, -1.5, key))
+    took = set()
+    for seed in range(4):
+        keys = jax.random.split(jax.random.split(jax.random.key(seed), 1)[0], 4)
+        coin = int(jax.random.bernoulli(keys[0]))
+        expected = improve[coin](state, keys[1])
+        short = adjust(expected.auxiliary, now.auxiliary, keys[2])
+        own = adjust(augmented_learner(expected), now.augmented, keys[3])
+        near(whole(jax.random.key(seed)), with_augmented(expected._replace(auxiliary=short), own))
+        took.add(coin)
+    assert took == {0, 1}
 
 
 def test_a_coin_says_which_actor_learns() -> None:

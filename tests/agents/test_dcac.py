@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from conftest import learned, record
 from delayrl.agents.dcac import DCAC, Roll, values
@@ -168,6 +169,16 @@ def test_the_delay_holds_the_terminal_state_back() -> None:
     np.testing.assert_array_equal(rolls.x_last[ended, 0], rolls.x_last[ended, 1])  # the last shows t = T
     np.testing.assert_array_equal(rolls.steps[ended], windows.lead[ended])
     np.testing.assert_allclose(rolls.reward[ended, 0], rolls.x[ended, 0] + 1)
+    # of the new actions that the last state shows, the first `steps` were taken from x on: their densities count
+    _, agent, actor = rolled("terminated")
+    policy = jax.jit(agent.policy)
+    for i in np.flatnonzero(ended)[:20]:
+        action = rolls.x_last[i, 2 + DELAY - int(rolls.steps[i])]
+        mean, log_std = (x[0] for x in policy(actor, rolls.x[i]))
+        normal = stats.norm.logpdf(np.arctanh(np.float64(action)), mean, np.exp(np.float64(log_std)))
+        np.testing.assert_allclose(
+            rolls.log_prob[i, 0], normal - np.log(1 - np.float64(action) ** 2), rtol=1e-3, atol=1e-3
+        )
     recorded = [network_input(view(jax.tree.map(lambda x, i=i: x[i], windows)), "augmented") for i in range(600)]
     np.testing.assert_array_equal(rolls.x[~ended], np.stack(recorded)[~ended])
 
@@ -199,6 +210,31 @@ def test_gradients() -> None:
     of_actor, of_critic = gradient(dataclasses.replace(AGENT, actor_share=0.0), state.critic)
     assert size(of_actor) == 0
     assert size(of_critic) > 0
+
+
+def test_critics_do_not_move_the_actor_at_ends() -> None:
+    """A stretch that starts at an episode's end starts with new actions; its error is the critics' alone."""
+    state, windows = AGENT.init(COUNTER, jax.random.key(1)), jax.tree.map(lambda x: x[:64], counter("terminated"))
+    agent = dataclasses.replace(AGENT, actor_share=0.0)
+    batch = state.target, windows, jax.random.key(5), 1.0
+    of_actor, _ = jax.jit(jax.grad(lambda params: agent.loss(params, *batch)[0]))((state.actor, state.critic))
+    assert all((x == 0).all() for x in jax.tree.leaves(of_actor))
+
+
+def test_the_target_is_of_the_target_critics() -> None:
+    """Of all critic weights, those of the target networks alone reach the target; and every window has its noise."""
+    state, windows = parts()
+    twice = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), windows)
+    actor = state.actor
+    loss = jax.jit(lambda critic, target: AGENT.loss((actor, critic), target, twice, jax.random.key(5), 1.0)[1])
+    keys = jax.random.split(jax.random.key(5), 2)
+    rolls = jax.vmap(AGENT.roll, (None, 0, 0))(actor, twice, keys)
+    assert not np.array_equal(rolls.log_prob[0], rolls.log_prob[1])
+    other = AGENT.init(Spec(10, 2, 3), jax.random.key(9)).target
+    for target in (state.target, other):
+        y = AGENT.soft_return(rolls, 5.0, 1.0, values(target, rolls.x_last))
+        error = ((values(state.critic, rolls.x) - y) ** 2).mean(-1).sum()
+        np.testing.assert_allclose(loss(state.critic, target)["critic_loss"], error, rtol=1e-4)
 
 
 def test_gradient_reaches_the_first_action() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import learned, record
+from delayrl.agents.base import Schedule
 from delayrl.agents.dida import DIDA
 from delayrl.agents.sac import SAC
 from delayrl.core import replay as ring
@@ -101,11 +102,11 @@ def test_imitation_loss_by_hand() -> None:
 def test_rmsprop_is_pytorchs() -> None:
     """w ← w - lr g / (√v + ε), v ← .9 v + .1 g²: the first step is lr / √.1 in every direction with a gradient."""
     optimiser = DIDA().optimiser
-    gradient = jnp.array([2.0, -0.5, 0.0])
-    change, memory = optimiser.update(gradient, optimiser.init(jnp.zeros(3)))
-    np.testing.assert_allclose(change, [-1e-3 / 0.1**0.5, 1e-3 / 0.1**0.5, 0], rtol=1e-5)
+    gradient = jnp.array([2.0, -0.5, 0.0, 1e-6])  # for the last an ε inside the root would not be small
+    change, memory = optimiser.update(gradient, optimiser.init(jnp.zeros(4)))
+    np.testing.assert_allclose(change, np.array([-1e-3, 1e-3, 0, -1e-3]) / 0.1**0.5, rtol=1e-3)
     change, _ = optimiser.update(gradient, memory)
-    np.testing.assert_allclose(change, [-1e-3 / 0.19**0.5, 1e-3 / 0.19**0.5, 0], rtol=1e-5)
+    np.testing.assert_allclose(change, np.array([-1e-3, 1e-3, 0, -1e-3]) / 0.19**0.5, rtol=1e-3)
 
 
 def test_who_acts() -> None:
@@ -137,6 +138,10 @@ def test_it_asks_for_what_it_needs() -> None:
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
     with pytest.raises(DelayRLError, match="a multiple of round_steps = 10; got 25"):
         dataclasses.replace(AGENT, expert_steps=25).init(SPEC, jax.random.key(0))
+    AGENT.check(Schedule(steps=21, random_steps=19))
+    for schedule in (Schedule(steps=20, random_steps=5), Schedule(steps=40, random_steps=20)):
+        with pytest.raises(DelayRLError, match="must lie between"):
+            AGENT.check(schedule)
 
 
 def test_under_the_loop() -> None:
@@ -168,3 +173,4 @@ def test_defaults_are_the_released_codes() -> None:
     assert (agent.student_learning_rate, agent.student_decay, agent.round_steps) == (1e-3, 0.9, 1000)
     assert agent.reference == SAC()
     assert agent.phases()[1][:3] == (1000, 1000, 32)
+    assert AGENT.phases()[1][:2] == (10, 3)

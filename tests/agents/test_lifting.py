@@ -11,6 +11,7 @@ from scipy import integrate, stats
 
 from conftest import learned, record
 from delayrl.agents import lifting
+from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import Lifting, lifting_loss, moments
 from delayrl.agents.sac import BPQL
 from delayrl.core import networks
@@ -199,6 +200,19 @@ def test_lifting_loss_is_of_one_step() -> None:
     np.testing.assert_allclose(metrics["lifting_loss"], lifting_loss(delayed, reference), rtol=1e-4)
 
 
+def test_it_pulls_towards_the_updated_reference() -> None:
+    """The reference learns first; the delayed policy is compared with what it has learned."""
+    bpql = dataclasses.replace(TINY.bpql, actor_learning_rate=0.1)
+    agent = dataclasses.replace(TINY, bpql=bpql)
+    state = agent.init(SPEC, jax.random.key(0))
+    new, metrics = agent.update(state, windows(), jax.random.key(1), jnp.int32(0))
+    x, s = augmented(windows()), windows().obs[:, DELAY]
+    delayed = bpql.policy(state.delayed.actor, x)
+    before, after = (lifting_loss(delayed, bpql.policy(r.actor, s)) for r in (state.reference, new.reference))
+    assert abs(before - after) > 0.01
+    np.testing.assert_allclose(metrics["lifting_loss"], after, rtol=1e-4)
+
+
 def test_it_acts_by_the_delayed_policy() -> None:
     """Unprivileged: in training as well it needs no true state."""
     state = TINY.init(SPEC, jax.random.key(0))
@@ -211,6 +225,9 @@ def test_it_acts_by_the_delayed_policy() -> None:
 
 
 def test_hold_is_before_end() -> None:
+    Lifting(lifting_end=800_000).check(Schedule(steps=800_000))
+    with pytest.raises(DelayRLError, match="no later than steps, 800000; got 800001"):
+        Lifting(lifting_end=800_001).check(Schedule(steps=800_000))
     with pytest.raises(DelayRLError, match="no later than lifting_end = 750000; got 800000"):
         Lifting(lifting_hold=800_000).init(SPEC, jax.random.key(0))
 

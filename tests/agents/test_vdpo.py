@@ -6,14 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, ENV, OBS, counted, same, seen
+from learning import ACT, ENV, OBS, counted, random_windows, same, seen
 
 from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS
 from delayrl.agents.vdpo import VDPO, Unseen, unseen
 from delayrl.core import networks
 from delayrl.core import replay as ring
+from delayrl.core.networks import Gaussian
 from delayrl.core.types import Spec
+from delayrl.core.views import network_input
 
 
 def test_bfloat16_products_are_close(monkeypatch) -> None:
@@ -157,6 +159,77 @@ def networks_twin(state, truth, action):
     from delayrl.core.networks import twin
 
     return twin(state.reference.critic, truth, jnp.asarray(action))
+
+
+SPEC = Spec(OBS, ACT, 3)
+DROPPING = dataclasses.replace(TINY["vdpo"], dropout=0.5)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5])
+def test_belief_and_cloning_have_dropout(rate: float) -> None:
+    """Their losses depend on the key, and without dropout they do not."""
+    agent = dataclasses.replace(DROPPING, dropout=rate)
+    state, x = agent.init(SPEC, jax.random.key(0)), unseen(random_windows(SPEC))
+    belief = jax.jit(lambda key: agent.belief_loss((state.encoder, state.decoder), x, key)[0])
+    cloning = jax.jit(lambda key: agent.clone_loss({"head": state.head}, state, x, key)[0])
+    for loss in (belief, cloning):
+        assert (loss(jax.random.key(1)) != loss(jax.random.key(2))) == (rate > 0)
+
+
+def test_behaviour_has_dropout_and_evaluation_none(rng: np.random.Generator) -> None:
+    """A sample of the policy at the shown age, with dropout and noise of their own keys; at age 0 of the reference."""
+    agent = dataclasses.replace(DROPPING, behaviour="delayed")
+    state, key = agent.init(SPEC, jax.random.key(0)), jax.random.key(7)
+    dropout_key, delayed_key, *_ = jax.random.split(key, 4)
+    for age in (0, 1, 3):
+        what = seen(3, age, rng)
+        policy, plain = (agent.policy(state, what.obs, what.actions, k) for k in (dropout_key, None))
+        current = agent.reference.policy(state.reference.actor, what.obs)
+        at_age, mode = (Gaussian(p.mean[age - 1], p.log_std[age - 1]) if age else current for p in (policy, plain))
+        expected = networks.sample(at_age, delayed_key)[0]
+        np.testing.assert_allclose(agent.act(state, what, key, explore=True), expected, atol=1e-6)
+        np.testing.assert_allclose(agent.act(state, what, key, explore=False), networks.mode(mode), atol=1e-6)
+
+
+def test_the_two_policies_have_noise_of_their_own(rng: np.random.Generator) -> None:
+    state, what, key = DROPPING.init(SPEC, jax.random.key(0)), seen(3, 2, rng, truth=True), jax.random.key(7)
+    agent = dataclasses.replace(DROPPING, behaviour="reference")
+    reference_key = jax.random.split(key, 4)[2]
+    expected = networks.sample(agent.reference.policy(state.reference.actor, what.truth), reference_key)[0]
+    np.testing.assert_allclose(agent.act(state, what, key, explore=True), expected, atol=1e-6)
+
+
+def test_the_reference_is_sac() -> None:
+    """It learns as SAC does, from the same batch, by a key and a count of its own."""
+    agent = dataclasses.replace(TINY["vdpo"], representation="mlp")
+    state, windows, key = agent.init(SPEC, jax.random.key(0)), random_windows(SPEC), jax.random.key(1)
+    new, metrics = jax.jit(agent.update)(state, windows, key, jnp.int32(1))
+    update = jax.jit(agent.reference.update)
+    expected, of_sac = update(state.reference, windows, jax.random.split(key)[0], jnp.int32(1))
+    assert not same(expected.actor, state.reference.actor)
+    for a, b in zip(jax.tree.leaves((new.reference, metrics)), jax.tree.leaves((expected, of_sac)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_phases() -> None:
+    learn, clone = TINY["vdpo"].phases()
+    assert learn[:3] == (1, 1, 16)
+    assert clone[:3] == (10, 3, 16)
+
+
+def test_the_mlp_sees_the_augmented_state_of_each_age(rng: np.random.Generator) -> None:
+    agent = dataclasses.replace(TINY["vdpo"], representation="mlp")
+    for age in (1, 2, 3):
+        what = seen(3, age, rng)
+        rows = agent.encode({}, what.obs, what.actions, None)
+        np.testing.assert_allclose(rows[age - 1], network_input(what, "augmented"))
+
+
+def test_heads_start_small() -> None:
+    """Weights N(0, 0.02²) as in the released code, where PyTorch's layers would be uniform within 1 / √inputs."""
+    state = VDPO(TINY_SAC, width=64, layers=1).init(SPEC, jax.random.key(0))
+    for layer in (state.decoder, *state.head[:2]):
+        np.testing.assert_allclose(layer["w"].std(), 0.02, rtol=0.1)
 
 
 def test_paper_preset() -> None:
