@@ -8,11 +8,11 @@ check:     ## format, lint, types
 	ruff check .
 	mypy
 
-test:      ## everything that takes seconds
-	pytest -n 2 --dist loadfile
+test:      ## at least one test of everything, in minutes
+	pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test-all:  ## with the tests that train for minutes
-	pytest -m ''
+test-all:  ## all tests but those that train for minutes (pytest -m slow)
+	pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow'
 
 docs:      ## build the documentation; a broken link is an error
 	mkdocs build --strict

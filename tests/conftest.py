@@ -1,12 +1,23 @@
-"""Shapes in annotations are checked while the tests run; compiled code is not optimised, which halves their time."""
+"""Check shapes in annotations while the tests run, and keep what JAX compiles for them.
 
+Compiling takes most of the time. Compiled programs are therefore not optimised, and are stored in a folder that all
+processes of a test run share and the next run finds. JAX's key to it covers the program, the flags and the versions.
+"""
+
+import ctypes
 import gc
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+CACHE = Path(__file__).parents[1] / ".cache" / "jax"
+CACHE_BYTES = 2**30
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 from jaxtyping import install_import_hook
 
@@ -52,14 +63,32 @@ TINY = {
 }
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Empty the folder of compiled programs when it has grown large: each change of the code adds to it."""
+    if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in CACHE.glob("*")) > CACHE_BYTES:
+        shutil.rmtree(CACHE)
+
+
+def pytest_collection_finish() -> None:
+    """Spare garbage collections the objects of all imported modules: tracing allocates much, so they are frequent."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
-def few_memory_maps() -> Iterator[None]:
-    """Linux gives a process 65,530 memory maps; each compiled function takes some, and without any XLA crashes."""
+def little_memory() -> Iterator[None]:
+    """Drop compiled programs before they take a gigabyte, or so many of the 65,530 memory maps that XLA crashes."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+    status, maps = Path("/proc/self/status"), Path("/proc/self/maps")
+    if status.exists() and (resident(status) > 2**30 or maps.read_bytes().count(b"\n") > 20_000):
         jax.clear_caches()
         gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)  # compiling leaves hundreds of megabytes that are free, but not given back
+
+
+def resident(status: Path) -> int:
+    """Read how many bytes of memory a process occupies from its status file."""
+    return 1024 * int(status.read_text().split("VmRSS:")[1].split()[0])
 
 
 @pytest.fixture(scope="session")

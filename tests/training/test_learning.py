@@ -1,4 +1,4 @@
-"""Learning, with budgets and margins that held on seeds 0, 1 and 2. The slow ones run with `make test-all`."""
+"""Learning, with budgets and margins that held on seeds 0, 1 and 2. The slow ones run with `pytest -m slow`."""
 
 from pathlib import Path
 
