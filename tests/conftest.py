@@ -8,7 +8,7 @@ import ctypes
 import gc
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-from jaxtyping import install_import_hook
+from jaxtyping import install_import_hook  # noqa: E402
 
 install_import_hook(
     [
@@ -61,6 +61,11 @@ TINY = {
     "dida": DIDA(TINY_SAC, expert_steps=110, round_steps=10, imitation_updates=3, student_hidden=(8, 8)),
     "vdpo": VDPO(TINY_SAC, width=8, layers=2, clone_every=10, clone_updates=3),
 }
+
+
+def quick(names: Iterable[str], *kept: str) -> list:
+    """Return parameters of a test: those that `make test` keeps, and all others marked `thorough`."""
+    return [name if name in kept else pytest.param(name, marks=pytest.mark.thorough) for name in names]
 
 
 def pytest_configure(config: pytest.Config) -> None:

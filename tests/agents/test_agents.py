@@ -1,6 +1,7 @@
 """What holds for every agent, and the identities between them."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from learning import ACT, DELAYED, ENV, OBS, program_of, same, seen, trained
 
-from conftest import TINY, learned, record
+from conftest import TINY, learned, quick, record
 from delayrl.agents.random import Random
 from delayrl.agents.registry import AGENTS
 from delayrl.core.types import Seen, Spec
@@ -42,7 +43,7 @@ def test_same_seed_twice(name: str) -> None:
     assert same(trained(TINY[name], 3)[0].agent, trained(TINY[name], 3)[0].agent)
 
 
-@pytest.mark.parametrize("name", DELAYED)
+@pytest.mark.parametrize("name", quick(DELAYED, "bpql", "vdpo"))
 def test_lockstep_seeds_are_seeds_alone(name: str) -> None:
     """Three seeds beside each other learn what each learns alone, up to the rounding of batched products."""
     agent = TINY[name]
@@ -50,7 +51,7 @@ def test_lockstep_seeds_are_seeds_alone(name: str) -> None:
 
     def run(seeds: list[int]):
         keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-        *_, (learner, _) = learned(program_of(agent, 3), keys, [data[seed] for seed in seeds], 46, capacity=100)
+        *_, (learner, _) = learned(program_of(agent, 3), keys, [data[seed] for seed in seeds], 46)
         return learner.agent
 
     together = run([0, 1, 2])
@@ -69,7 +70,7 @@ def test_a_block_of_steps_is_its_steps(name: str) -> None:
     ends = []
     for block in (1, 5):
         metrics = {}
-        options = {"hidden": lambda step: step % 3, "capacity": 100, "block": block}
+        options = {"hidden": lambda step: step % 3, "block": block}
         for learner, new in learned(program, keys, [data], 61, **options):
             metrics |= new
             last = learner
@@ -80,8 +81,10 @@ def test_a_block_of_steps_is_its_steps(name: str) -> None:
 
 
 @pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="JAX 0.10, the newest for Python 3.11, copies the replay")
-@pytest.mark.parametrize("seeds", [1, 2])
-@pytest.mark.parametrize("block", [1, 4])
+@pytest.mark.parametrize(
+    ("block", "seeds"),
+    [(4, 2), *(pytest.param(*sizes, marks=pytest.mark.thorough) for sizes in [(1, 1), (1, 2), (4, 1)])],
+)
 def test_learning_copies_no_replay(seeds: int, block: int) -> None:
     """What the compiled step needs beside its arguments does not grow with the replay, which is updated in place."""
     program = program_of(TINY["bpql"], 3)
@@ -102,12 +105,13 @@ def test_acting_never_peeks(name: str, rng: np.random.Generator) -> None:
     """A deterministic action depends on nothing but (observation, age, actions since), whatever the truth is."""
     learner, _, _ = trained(TINY[name], 3)
     state = jax.tree.map(lambda x: x[0], learner.agent)
+    act = jax.jit(functools.partial(TINY[name].act, explore=False))
     for age in range(4):
-        what = seen(3, age, rng)
-        action = TINY[name].act(state, what, jax.random.key(0), explore=False)
+        what = seen(3, age, rng)._replace(truth=jnp.zeros(OBS))
+        action = act(state, what, jax.random.key(0))
         for truth in (-1e3, 1e3):  # whatever is handed to it
             told = what._replace(truth=jnp.full(OBS, truth))
-            np.testing.assert_array_equal(action, TINY[name].act(state, told, jax.random.key(1), explore=False))
+            np.testing.assert_array_equal(action, act(state, told, jax.random.key(1)))
         assert np.abs(np.asarray(action)).max() <= 1
 
 

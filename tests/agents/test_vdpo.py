@@ -76,8 +76,8 @@ def test_who_learns_what(representation: str) -> None:
     """Belief trains encoder and decoder; cloning the head alone, and the encoder too where nothing else does."""
     agent = dataclasses.replace(TINY["vdpo"], representation=representation)
     state, windows = vdpo_parts(agent)
-    updated, metrics = agent.update(state, windows, jax.random.key(1), jnp.int32(0))
-    cloned, _ = agent.clone(state, windows, jax.random.key(1), jnp.int32(0))
+    updated, metrics = jax.jit(agent.update)(state, windows, jax.random.key(1), jnp.int32(0))
+    cloned, _ = jax.jit(agent.clone)(state, windows, jax.random.key(1), jnp.int32(0))
     believes = representation == "transformer"
     assert ("belief_loss" in metrics) == believes
     assert same(updated.encoder, state.encoder) != believes

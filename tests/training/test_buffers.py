@@ -57,6 +57,7 @@ def test_what_is_large() -> None:
     assert not keep_buffers(AGENTS["random"].presets["small"].agent, Spec(17, 6, 0), 8)  # it learns nothing
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not glibc() or huge_pages(), reason="of glibc 2.35 and newer, with pages of 4 KB")
 def test_no_fresh_pages() -> None:
     assert int(python(FAULTS, "plain")) > 5_000

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import delayrl
+from conftest import quick
 from delayrl.agents.registry import AGENTS
 from delayrl.play.evaluation import evaluate
 
@@ -35,7 +36,7 @@ def test_memory_pays(tmp_path: Path) -> None:
     assert memoryless < 2 * augmented - 10
 
 
-@pytest.mark.parametrize("agent", [name for name in AGENTS if name not in ("random", "sac")])
+@pytest.mark.parametrize("agent", quick([name for name in AGENTS if name not in ("random", "sac")], "bpql", "vdpo"))
 def test_nobody_guesses_a_coin(agent: str, tmp_path: Path) -> None:
     """The state is a fresh coin, the reward a·s: the mean of 1,000 steps stays within 4 standard errors of 0."""
     own = {
