@@ -107,7 +107,7 @@ def test_acting_never_peeks(name: str, rng: np.random.Generator) -> None:
     state = jax.tree.map(lambda x: x[0], learner.agent)
     act = jax.jit(functools.partial(TINY[name].act, explore=False))
     for age in range(4):
-        what = seen(3, age, rng)._replace(truth=jnp.zeros(OBS))
+        what = seen(3, age, rng)
         action = act(state, what, jax.random.key(0))
         for truth in (-1e3, 1e3):  # whatever is handed to it
             told = what._replace(truth=jnp.full(OBS, truth))

@@ -90,6 +90,7 @@ def test_finished_cells_are_skipped(undisturbed, cache: Path) -> None:
     assert before == {path: path.stat().st_mtime_ns for path in runs.rglob("*.jsonl")}
 
 
+@pytest.mark.thorough
 def test_time_limit(tmp_path: Path, cache: Path) -> None:
     """The grid stops at a checkpoint with status 75 and releases its cells; the same command resumes it."""
     file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
@@ -132,6 +133,7 @@ def until(condition, timeout: float = 120) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.thorough
 def test_two_runners(undisturbed, tmp_path: Path, cache: Path) -> None:
     """Two runners share a grid: each cell begins and ends once, and both runners succeed."""
     file, runs = tiny(tmp_path), tmp_path / "runs"

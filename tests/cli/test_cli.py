@@ -14,8 +14,8 @@ from delayrl.run.configuration import options
 from delayrl.run.folder import Run
 
 SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
-SMALL += ["--batch-size", "8", "--hidden", "8", "8"]
-TINY = [*SMALL, "--width", "8", "--layers", "1", "--clone-every", "40", "--clone-updates", "3", "--quiet"]
+SMALL += ["--batch-size", "8", "--hidden", "8", "8", "--replay-capacity", "250"]
+TINY = [*SMALL, "--width", "8", "--layers", "1", "--clone-every", "50", "--clone-updates", "5", "--quiet"]
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import pytest
 from killing import KilledError, moments, options
 
 import delayrl
+from conftest import quick
 from delayrl.agents.registry import AGENTS
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
@@ -63,7 +64,7 @@ def die(agent: str, out: Path, now: Callable[[int, str, str], bool]) -> bool:
 
 
 @pytest.mark.parametrize("trial", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 8))])
-@pytest.mark.parametrize("agent", KILLED)
+@pytest.mark.parametrize("agent", quick(KILLED, "sac"))
 def test_killed_at_random_moments(agent: str, trial: int, tmp_path: Path, whole) -> None:
     """Several times in a row, half of them while something is written or deleted."""
     runs, found = whole(agent)
@@ -95,6 +96,7 @@ def sigkilled(agent: str, moment: int, out: Path, runs: list[Run]) -> None:
     assert_same(agent, out, runs)
 
 
+@pytest.mark.thorough
 def test_sigkill(tmp_path: Path, whole) -> None:
     """A process of its own, and the real signal."""
     runs, found = whole("bpql")
