@@ -7,9 +7,10 @@ import pytest
 
 import delayrl
 from delayrl.agents.registry import AGENTS
-from delayrl.core.protocol import OFFICIAL
+from delayrl.core.protocol import Protocol
 from delayrl.delays import as_delay
 from delayrl.envs import make
+from delayrl.play.evaluation import TRAINING, reset_seed
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.loop import hidden_steps
@@ -46,7 +47,7 @@ def test_official_protocol(tmp_path: Path) -> None:
     assert {row["reset_seed"] for row in rows} == {0}
     assert {row["protocol"] for row in rows} == {"official"}
     assert len({row["return"] for row in rows if row["step"] == 100}) == 2  # the first actions differ
-    actor = Actor(make("Reacher-v5", 3, rescale=True), 7, privileged=False, protocol=OFFICIAL)
+    actor = Actor(make("Reacher-v5", 3, rescale=True), 7, privileged=False, protocol=AGENTS["a-sac"].official)
     first = actor.truth
     steps = [actor.step(np.zeros(2, np.float32)) for _ in range(50)]
     assert steps[-1].done
@@ -73,3 +74,57 @@ def test_training_shows_what_the_wrapper_shows() -> None:
     for action in actions:
         actor.step(action)
     np.testing.assert_array_equal(actor.seen.actions, actions[-3:])
+
+
+def counter(seed: int = 0) -> Actor:
+    return Actor(make("delayrl/Counter-v0", 2, rescale=True), seed, privileged=False)
+
+
+def test_true_steps_are_stored() -> None:
+    """Not what the delay shows: states, ages before and after, and the end; each episode from its own seed."""
+    actor, bare = counter(), make("delayrl/Counter-v0")
+    for episode in range(5):
+        _, info = bare.reset(seed=reset_seed(0, TRAINING, episode))
+        length = int(info["truth"][1])
+        for t in range(length):
+            np.testing.assert_array_equal(actor.truth, [t, length])
+            step = actor.step(np.float32([t / 10]))
+            np.testing.assert_array_equal([step.obs, step.next_obs], [[t, length], [t + 1, length]])
+            assert (step.age, step.next_age) == (min(t, 2), min(t + 1, 2))
+            assert (step.action, step.reward) == (np.float32(t / 10), t + 1)
+            assert step.terminated == step.done == (t + 1 == length)
+        assert actor.episode == episode + 1
+        assert not actor.actions
+
+
+@pytest.mark.parametrize("limit", ["bootstraps", "terminates"])
+def test_time_limit(limit: str) -> None:
+    """It ends the episode; that no value follows, is said under the protocol alone that says so."""
+    protocol = Protocol("mine", time_limit=limit)  # type: ignore[arg-type]
+    actor = Actor(make("delayrl/Walk-v0", 2, rescale=True), 0, privileged=False, protocol=protocol)
+    steps = [actor.step(np.zeros(1, np.float32)) for _ in range(50)]
+    assert [bool(step.done) for step in steps] == [False] * 49 + [True]
+    assert [bool(step.terminated) for step in steps] == [False] * 49 + [limit == "terminates"]
+
+
+def test_one_start_state_has_many_travel_times() -> None:
+    protocol = Protocol("mine", start_states="same")
+    actor = Actor(make("delayrl/Walk-v0", "uniform:0:3", rescale=True), 7, privileged=False, protocol=protocol)
+    starts, ages = [], []
+    for _ in range(3):
+        starts.append(actor.truth.tolist())
+        ages.append([int(actor.step(np.zeros(1, np.float32)).next_age) for _ in range(50)])
+    assert starts[0] == starts[1] == starts[2]
+    assert ages[0] != ages[1] != ages[2]
+
+
+def test_a_resumed_episode_is_the_same() -> None:
+    """The same seed and actions lead to the same state, with its history."""
+    actor, again = counter(), counter()
+    while actor.episode < 3 or len(actor.actions) < 3:
+        actor.step(np.float32([0.1 * len(actor.actions)]))
+    again.replay_episode(actor.episode, np.array(actor.actions))
+    np.testing.assert_array_equal(again.truth, actor.truth)
+    np.testing.assert_array_equal(again.actions, actor.actions)
+    for one, other in zip(again.seen[:3], actor.seen[:3], strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,99 @@
+"""The order of acting, learning, evaluating and saving, and who chooses which action."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from delayrl.agents.base import Schedule
+from delayrl.core.protocol import CORRECTED, Protocol
+from delayrl.core.types import Spec
+from delayrl.delays import as_delay
+from delayrl.envs import make
+from delayrl.training import loop
+from delayrl.training.actor import Actor
+from delayrl.training.loop import Loop
+from delayrl.training.state import TrainState
+
+SCHEDULE = Schedule(steps=10, random_steps=4, updates_per_call=2, evaluate_every=4)
+SEEDS = [3, 4]
+
+
+def trained(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, protocol: Protocol = CORRECTED) -> tuple[list, Any]:
+    """Run the loop with a program that acts with 0.5 and learns nothing. Returns its calls and the executed actions."""
+    calls: list[tuple] = []
+
+    class Recorder:
+        def evaluate(self, step: int, agent: Any) -> str:
+            calls.append(("evaluate", step))
+            return ""
+
+    class Fake:
+        def act(self, agent: Any, seen: Any, keys: Any, step: int) -> Any:
+            calls.append(("act", step))
+            return np.full((len(SEEDS), 1), 0.5, np.float32)
+
+        def learn(self, learner: Any, pending: list, keys: Any, last: int, first: int) -> tuple:
+            calls.append(("learn", last, len(pending)))
+            return learner, {}, last >= first
+
+    def save(group: Any, state: TrainState, *, complete: bool = False) -> TrainState:
+        calls.append(("save", state.step, complete))
+        return state
+
+    executed: list[list[tuple[int, float]]] = [[] for _ in SEEDS]  # (step of the episode, action)
+
+    class Watched(Actor):
+        def step(self, action: Any) -> Any:
+            executed[SEEDS.index(self.seed)].append((len(self.actions), float(action[0])))
+            return super().step(action)
+
+    monkeypatch.setattr(loop, "save", save)
+    monkeypatch.setattr(loop, "Actor", Watched)
+    actors = [Watched(make("delayrl/Counter-v0", 2, rescale=True), seed, False, protocol) for seed in SEEDS]
+    setup = SimpleNamespace(schedule=schedule, delay=as_delay(2), protocol=protocol)
+    group: Any = SimpleNamespace(
+        setup=setup, seeds=SEEDS, keys=None, spec=Spec(2, 1, 2), program=Fake(), apply=map, runs=[]
+    )
+    learner: Any = SimpleNamespace(agent=None, replay=SimpleNamespace(steps=np.array([99, 99])))
+    state = TrainState(0, learner, actors, [], None, [{}, {}], [(0, 0), (0, 0)])
+    bar = SimpleNamespace(update=lambda count: None, set_postfix_str=lambda text: None)
+    Loop(group, state, Recorder()).train(lambda: False, bar)  # type: ignore[arg-type]
+    return calls, executed
+
+
+def test_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Actions are chosen before the update that follows a step; what is evaluated has learned from every step."""
+    calls, _ = trained(monkeypatch, SCHEDULE)
+    assert calls == [
+        ("learn", 2, 2),
+        *(("act", 4), ("learn", 4, 2), ("evaluate", 4), ("save", 4, False)),
+        *(("act", 5), ("act", 6), ("learn", 6, 2), ("act", 7)),
+        *(("act", 8), ("learn", 8, 2), ("evaluate", 8), ("save", 8, False)),
+        *(("act", 9), ("act", 10), ("learn", 10, 2), ("evaluate", 10), ("save", 10, True)),
+    ]
+
+
+def test_random_actions_are_of_seed_and_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, executed = trained(monkeypatch, SCHEDULE)
+    drawn = np.array([[action for _, action in of_seed[:4]] for of_seed in executed])
+    assert len(np.unique(drawn)) == 8
+    assert (np.abs(drawn) <= 1).all()
+    assert all(action == 0.5 for of_seed in executed for _, action in of_seed[4:])
+
+
+@pytest.mark.parametrize(("opening", "length"), [("agent", 0), ("one-random", 1), ("random", 2), ("zeros", 2)])
+def test_openings(opening: Any, length: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under a delay of 2: of every episode that many first actions are the protocol's, all later ones the agent's."""
+    schedule = Schedule(steps=30, random_steps=0, updates_per_call=1, evaluate_every=30)
+    _, executed = trained(monkeypatch, schedule, replace(CORRECTED, opening=opening))
+    opens = [action for of_seed in executed for moment, action in of_seed if moment < length]
+    later = [action for of_seed in executed for moment, action in of_seed if moment >= length]
+    assert later == [0.5] * len(later) != []
+    assert len(opens) >= 4 * length
+    if opening == "zeros":
+        assert not any(opens)
+    else:
+        assert len({*opens, 0.0, 0.5}) == len(opens) + 2
