@@ -43,7 +43,8 @@ def test_the_page_says_what_the_summary_says() -> None:
     (result,) = [r for r in shown["results"] if r["agent"] == vdpo]
     assert result["mean"] == [5, 115, 110]
     assert result["normalised"] == pytest.approx([1, math.sqrt(0.5)])
-    assert result["reached"] == [200, 2]
+    assert (result["reached"], result["missed"]) == (200, False)
+    assert result["area"] == pytest.approx([(0.5 + 5 / 6) / 2, math.sqrt(2) / 6])
     assert shown["anchors"][result["anchor"]]["random"]["value"] == 10
     json.dumps(shown, allow_nan=False)
 
@@ -52,7 +53,7 @@ def test_steps_are_integers_and_exact() -> None:
     cells = small(steps=1_234_567)
     every = [r | {"step": 1_234_567} for r in anchored(cells, vdpo=[[0.0, 0, 500], [0.0, 0, 500]]) if r["step"] == 300]
     shown = payload(summarise(every, [*cells.values()]), "title")
-    assert [r["reached"][0] for r in shown["results"] if not r["isAnchor"]] == [1_234_567]
+    assert [r["reached"] for r in shown["results"] if not r["isAnchor"]] == [1_234_567]
 
 
 # The page in a browser
@@ -138,7 +139,7 @@ def test_page_shows_all_digits_of_steps(opened: Any) -> None:
     cells = small()
     view = opened([*cells.values()], anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]]))
     heads = view.locator("#all thead th").all_inner_texts()
-    assert sorted(column(view, "all", heads.index("Steps to Ret_df"))) == ["", "200", "300"]
+    assert sorted(column(view, "all", heads.index("Steps to Ret_df"))) == ["", "", "200\n200 to 200"]
 
 
 def test_page_rounds_once(opened: Any) -> None:
@@ -187,7 +188,7 @@ def test_page_draws_curves_and_shows_values(opened: Any) -> None:
 
 def test_page_marks_what_goes_on(opened: Any) -> None:
     view = opened(*sampled())
-    states = column(view, "all", 10)
+    states = column(view, "all", 11)
     assert "at 400,000 of 1,000,000 steps" in states
     assert "failed at 200,000 of 1,000,000 steps" in states
     assert "todo" in states

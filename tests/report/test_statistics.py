@@ -7,11 +7,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from delayrl.report import statistics as s
 
 FLOATS = st.floats(-1e6, 1e6)
+
+
+def sure(*scores: ArrayLike) -> list[s.Stratum]:
+    """Tasks whose anchors are known exactly, 0 and 1, so that returns are scores."""
+    return [s.Stratum(np.zeros(2), np.ones(2), [np.asarray(x, float)]) for x in scores]
+
+
+def mean(scores: s.Floats) -> s.Floats:
+    return scores.mean(-1)
 
 
 def test_mean_and_sample_deviation() -> None:
@@ -37,6 +47,16 @@ def test_steps_to_threshold_is_the_first_crossing() -> None:
     assert math.isnan(s.steps_to_threshold([], [], 5))
 
 
+def test_smoothed_by_hand() -> None:
+    np.testing.assert_allclose(s.smoothed([1, 2, 3, 4, 5, 6, 12]), [1, 1.5, 2, 2.5, 3, 4, 6])
+    np.testing.assert_allclose(s.smoothed([[7.0] * 9, [1.0, 2] + [3] * 7])[:, :2], [[7, 7], [1, 1.5]])
+
+
+def test_area_by_hand() -> None:
+    """Each evaluation stands for the steps since the one before."""
+    np.testing.assert_allclose(s.area([10, 20, 40], [[1, 2, 5], [3, 3, 3]]), [(10 + 20 + 100) / 40, 3])
+
+
 def test_interquartile_mean_by_hand() -> None:
     assert s.interquartile_mean([8, 1, 100, 2, 3, 4, -50, 5]) == (2 + 3 + 4 + 5) / 4
     assert s.interquartile_mean([4]) == 4
@@ -56,14 +76,14 @@ def test_bootstrap_agrees_with_every_possible_resample() -> None:
         for a in itertools.product(strata[0], repeat=3)
         for b in itertools.product(strata[1], repeat=3)
     ]
-    low, high = s.stratified_bootstrap(strata, s.interquartile_mean, repetitions=40_000)
+    low, high = s.stratified_bootstrap(sure(*strata), s.interquartile_mean, repetitions=40_000)
     exact = np.percentile(every, [2.5, 97.5])
     np.testing.assert_allclose([low, high], exact, atol=0.3)
 
 
 def test_bootstrap_agrees_with_scipy() -> None:
     scores = np.random.default_rng(1).normal(size=30)
-    low, high = s.stratified_bootstrap([scores], s.interquartile_mean, repetitions=20_000)
+    low, high = s.stratified_bootstrap(sure(scores), s.interquartile_mean, repetitions=20_000)
     reference = stats.bootstrap(
         (scores,), lambda x, axis: s.interquartile_mean(x), method="percentile", n_resamples=20_000, rng=2
     ).confidence_interval
@@ -72,23 +92,79 @@ def test_bootstrap_agrees_with_scipy() -> None:
 
 def test_bootstrap_keeps_runs_in_their_task() -> None:
     """Tasks that differ and whose runs do not: resampling within them changes nothing."""
-    low, high = s.stratified_bootstrap([[1, 1, 1], [9, 9, 9]], lambda x: x.mean(-1))
+    low, high = s.stratified_bootstrap(sure([1, 1, 1], [9, 9, 9]), mean)
     assert low == high == 5
+
+
+def test_anchors_are_resampled_with_the_runs() -> None:
+    """Two runs each of agent, random and reference: 4 × 4 × 4 equally likely resamples, all of them counted."""
+    returns, random, reference = np.array([40.0, 70.0]), np.array([0.0, 10.0]), np.array([90.0, 130.0])
+    twice = [list(itertools.product(x, repeat=2)) for x in (returns, random, reference)]
+    every = [(np.mean(x) - np.mean(r)) / (np.mean(df) - np.mean(r)) for x, r, df in itertools.product(*twice)]
+    low, high = s.stratified_bootstrap([s.Stratum(random, reference, [returns])], mean, repetitions=40_000)
+    np.testing.assert_allclose([low, high], np.percentile(every, [2.5, 97.5]), atol=0.02)
+
+
+def test_conditions_of_one_task_share_its_anchors() -> None:
+    """Equal returns differ by nothing then; with anchors drawn for each, they would."""
+    anchors, returns = (np.array([0.0, 1.0]), np.array([9.0, 15.0])), np.array([5.0, 5.0])
+    difference = lambda x: x[..., :2].mean(-1) - x[..., 2:].mean(-1)  # noqa: E731
+    assert s.stratified_bootstrap([s.Stratum(*anchors, [returns, returns])], difference) == (0, 0)
+    low, high = s.stratified_bootstrap([s.Stratum(*anchors, [returns])] * 2, difference)
+    assert low < 0 < high
+
+
+def test_no_interval_where_the_reference_may_be_worse_than_random() -> None:
+    stratum = s.Stratum(np.array([0.0, 10.0]), np.array([5.0, 50.0]), [np.array([20.0, 30.0])])
+    assert all(np.isnan(s.stratified_bootstrap([stratum], mean)))
 
 
 def test_bootstrap_covers_as_often_as_it_says() -> None:
     random = np.random.default_rng(0)
     hits = 0
     for trial in range(200):
-        low, high = s.stratified_bootstrap(
-            [random.normal(size=25), random.normal(3, 1, 25)], lambda x: x.mean(-1), 400, seed=trial
-        )
+        low, high = s.stratified_bootstrap(sure(random.normal(size=25), random.normal(3, 1, 25)), mean, 400, trial)
         hits += low <= 1.5 <= high
     assert 0.88 <= hits / 200 <= 0.99
 
 
+def test_bootstrap_covers_a_normalised_mean_only_with_the_anchors_uncertainty() -> None:
+    """Agent and reference are equal, so that the true value is 1, and the reference is as uncertain as the agent."""
+    random = np.random.default_rng(0)
+    hits = {"resampled": 0, "taken as exact": 0}
+    for trial in range(200):
+        returns, reference = random.normal(10, 2, 25), random.normal(10, 2, 25)
+        for name, anchor in (("resampled", reference), ("taken as exact", np.full(25, reference.mean()))):
+            low, high = s.stratified_bootstrap([s.Stratum(np.zeros(2), anchor, [returns])], mean, 400, trial)
+            hits[name] += low <= 1 <= high
+    assert 0.88 <= hits["resampled"] / 200 <= 0.99
+    assert hits["taken as exact"] / 200 < 0.88
+
+
 def test_one_run_has_no_interval() -> None:
-    assert all(np.isnan(s.stratified_bootstrap([[1.0, 2.0], [3.0]], s.interquartile_mean)))
+    assert all(np.isnan(s.stratified_bootstrap(sure([1.0, 2.0], [3.0]), s.interquartile_mean)))
+    for anchors in ((np.zeros(1), np.ones(2)), (np.zeros(2), np.ones(1))):
+        assert all(np.isnan(s.stratified_bootstrap([s.Stratum(*anchors, [np.array([1.0, 2.0])])], mean)))
+
+
+def test_interval_of_steps_agrees_with_every_possible_resample() -> None:
+    steps, curves = [10, 20, 30, 40], np.array([[0.0, 3, 6, 8], [1.0, 5, 9, 9], [0.0, 1, 2, 4]])
+    reference = np.array([4.0, 6.0])
+    every = sorted(
+        next((step for step, x in zip(steps, curves[list(a)].mean(0), strict=True) if x >= np.mean(b)), math.inf)
+        for a in itertools.product(range(3), repeat=3)
+        for b in itertools.product(reference, repeat=2)
+    )
+    assert s.bootstrap_steps(steps, curves, reference, 40_000) == (every[2], every[-3])  # of 108
+    assert every[2] == 20
+    assert every[-3] == math.inf
+    assert s.bootstrap_steps(steps, curves + 100, reference) == (10, 10)
+    assert s.bootstrap_steps(steps, curves - 100, reference) == (math.inf, math.inf)
+
+
+def test_interval_of_steps_needs_two_runs_of_either() -> None:
+    for runs, seeds in ((1, 2), (2, 1), (2, 0)):
+        assert np.isnan(s.bootstrap_steps([10], np.ones((runs, 1)), np.ones(seeds))).all()
 
 
 def test_performance_profile_by_hand() -> None:

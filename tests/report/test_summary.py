@@ -28,15 +28,19 @@ def test_a_table_of_the_paper_by_hand() -> None:
     result = of(summary, "vdpo")
     assert result.curves.steps.tolist() == [100, 200, 300]
     assert result.random_anchor.value == 10
-    assert result.reference_anchor[:3] == (110, 2, "sac, no delay")
-    np.testing.assert_allclose(result.normalise(result.curves.final), [0.5, 1.5])
-    assert result.steps_to_threshold == 200  # mean 115; it falls to 110 after, and the first time counts
+    assert result.reference_anchor.value == 110
+    assert (result.reference_anchor.returns.tolist(), result.reference_anchor.source) == ([100, 120], "sac, no delay")
+    np.testing.assert_allclose(result.final, [0.5, 1.5])
+    np.testing.assert_allclose(result.area, [(60 - 10) / 100, (280 / 3 - 10) / 100])
+    assert result.threshold == pytest.approx((150 / 3 + 170 / 3) / 2)  # delay-free SAC, smoothed as the curve is
+    assert result.steps_to_threshold == 200  # smoothed means 5, 60 and 77
     assert result.seeds_at_threshold == 2
 
     normalised, steps = summary.tables
     entry = normalised.entries["delayrl/Ant-v4", 5, "vdpo"]
     assert (entry.value, entry.std) == (1.0, pytest.approx(math.sqrt(0.5)))
     assert (entry.raw, entry.raw_std) == (110, pytest.approx(math.sqrt(5000)))
+    assert entry.area == pytest.approx((0.5 + 5 / 6) / 2)
     assert entry.published is None  # it trains for 300 steps, the paper for a million
     assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].value == 200
     (aggregate,) = summary.aggregates
@@ -52,21 +56,53 @@ def test_without_anchors_there_are_raw_returns_and_nothing_else() -> None:
         entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
         assert math.isnan(entry.value)
         assert entry.raw == 3
+        assert math.isnan(entry.area)
+        assert np.isnan(entry.interval).all()
         assert not summary.aggregates
 
 
-def test_reference_rows_anchor_where_there_is_no_sac() -> None:
+def test_a_reference_inside_another_agent_is_no_anchor() -> None:
+    """It may be frozen, coupled to the delayed policy, or have learned from its data: the cell is raw only."""
     cells = small()
     del cells["sac"]
     inner = [r for seed in range(2) for r in curve(cells["vdpo"], seed, [0.0, 10, 210], "reference")]
     every = anchored(cells | small(), vdpo=[[0.0, 0, 110], [0.0, 0, 110]])
     summary = summarise([r for r in every if r["agent"] != "sac"] + inner, [*cells.values()])
     result = of(summary, "vdpo")
-    assert result.reference_anchor[:3] == (210, 2, "the reference inside vdpo, Δ=5")
-    np.testing.assert_allclose(result.normalise(result.curves.final), [0.5, 0.5])
-    for table in summary.tables:  # not only below: the tables' heads promise the delay-free return
-        assert "Ret_df: the reference inside vdpo, Δ=5" in table.entries["delayrl/Ant-v4", 5, "vdpo"].note
-    assert "the reference inside vdpo" in markdown(summary, "t", {})
+    assert result.reference_anchor.returns.size == 0
+    assert np.isnan([*result.final, result.threshold, result.steps_to_threshold, *result.steps_interval]).all()
+    for table in summary.tables:
+        entry = table.entries["delayrl/Ant-v4", 5, "vdpo"]
+        assert (math.isnan(entry.value), entry.missed, entry.raw) == (True, False, 110)
+
+
+def test_the_anchors_uncertainty_is_in_the_intervals() -> None:
+    """Two seeds of an agent that agree: what is left is the reference's spread, and random's."""
+    cells, agent = small(), [[0.0, 0, 60], [0.0, 0, 60]]
+    exact = {"sac": [[0.0, 0, 110]] * 2, "random": [[10.0] * 3] * 2}
+    result = of(summarise(anchored(cells, vdpo=agent, **exact), [*cells.values()]), "vdpo")
+    assert result.final_interval == (0.5, 0.5)
+    spread = summarise(anchored(cells, vdpo=agent, **exact | {"sac": [[0.0, 0, 60], [0.0, 0, 160]]}), [*cells.values()])
+    assert of(spread, "vdpo").final_interval == pytest.approx((50 / 150, 1))
+    (aggregate,) = spread.aggregates
+    assert (aggregate.iqm, aggregate.low, aggregate.high) == pytest.approx((0.5, 50 / 150, 1))
+    random = summarise(anchored(cells, vdpo=agent, **exact | {"random": [[0.0] * 3, [20.0] * 3]}), [*cells.values()])
+    assert of(random, "vdpo").final_interval == pytest.approx((40 / 90, 60 / 110))
+
+
+def test_steps_to_the_threshold_have_an_interval() -> None:
+    """One seed of two reaches it at the second evaluation; the mean and the other never do."""
+    cells = small()
+    curves = {"sac": [[0.0, 0, 90]] * 2, "vdpo": [[0.0, 70, 0], [0.0, 0, 0]]}
+    summary = summarise(anchored(cells, **curves), [*cells.values()])
+    result = of(summary, "vdpo")
+    assert result.threshold == 30
+    assert result.missed
+    assert result.steps_interval == (200, math.inf)
+    assert result.seeds_at_threshold == 1
+    text = markdown(summary, "t", {})
+    assert "**×**<br>200 to ×<br>raw 0.00 ± 0.00<br>1/2 seeds" in text
+    assert "| ×<br>200 to × | 2/2 | 300 | done |" in text
 
 
 @pytest.mark.parametrize("change", [{"protocol": "official"}, {"steps": 200}, {"preset": "small"}])

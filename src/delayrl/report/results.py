@@ -140,7 +140,7 @@ class Result:
     @property
     def steps_to_threshold(self) -> float:
         """The step at which the smoothed mean over the seeds first reaches the reference's; NaN if it does not."""
-        if not self.runs:
+        if not self.runs or self.is_anchor:
             return NAN
         return float(statistics.steps_to_threshold(self.curves.steps, self.smoothed.mean(0), self.threshold))
 
