@@ -88,6 +88,22 @@ def test_dropout_is_off_without_key(rng: np.random.Generator) -> None:
     assert np.abs(np.asarray(dropped - plain)).max() > 0.1
 
 
+def test_dropout_is_everywhere(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the embedding, and in each block of attention and of both residuals; each time with a mask of its own."""
+    masks = []
+
+    def noted(kept: Any, rate: float, x: jax.Array) -> jax.Array:
+        masks.append(None if kept is None else (kept.shape, np.asarray(kept).tobytes()))
+        return dropout(kept, rate, x)
+
+    monkeypatch.setattr("delayrl.core.transformer.dropout", noted)
+    obs, actions = jnp.asarray(rng.normal(size=(2, 5))), jnp.asarray(rng.normal(size=(2, 6, 3)))
+    transformer(random_params(), obs, actions, 0.5, jax.random.key(0))
+    stream, square = (2, 6, 16), (2, 6, 6)
+    assert [shape for shape, _ in masks] == [stream, *[square, stream, stream] * 3]
+    assert len(set(masks)) == 10
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2**31 + 5])
 def test_bits_are_threefry_of_jax(seed: int) -> None:
     key = jax.random.key(seed)
@@ -108,6 +124,26 @@ def test_dropout_keeps_the_mean(rate: float) -> None:
         assert abs(np.corrcoef(first, second)[0, 1]) < 0.005
 
 
+def test_mlp_by_hand() -> None:
+    """relu(1·2 - 1) = 1 and relu(-2 + 1) = 0, so -3·1 + 5·0 + 1 = -2: the output has no activation."""
+    layers = [
+        {"w": jnp.array([[2.0, -2.0]]), "b": jnp.array([-1.0, 1.0])},
+        {"w": jnp.array([[-3.0], [5.0]]), "b": jnp.ones(1)},
+    ]
+    np.testing.assert_allclose(networks.mlp(layers, jnp.ones(1)), [-2.0])
+
+
+def test_critics_by_hand() -> None:
+    """Q_1 = s + 10 a and Q_2 = 2 s - a at (s, a) = (1, ±1): 11 and 1, -9 and 3; the lower minimum is that of a = -1."""
+    critic = [[{"w": jnp.array([[s], [a]]), "b": jnp.zeros(1)}] for s, a in ((1.0, 10.0), (2.0, -1.0))]
+    s, one, other = jnp.ones(1), jnp.ones(1), -jnp.ones(1)
+    np.testing.assert_allclose(networks.twin(critic, s, one), [11.0, 1.0])
+    np.testing.assert_allclose(networks.twin(critic, s, other), [-9.0, 3.0])
+    assert networks.lower_q(critic, s, one, other) == networks.lower_q(critic, s, other, one) == -1.0
+    twins = networks.twin_init(jax.random.key(0), (3, 1))
+    assert not np.array_equal(twins[0][0]["w"], twins[1][0]["w"])
+
+
 @pytest.mark.parametrize("log_std", [-5.0, 0.0, 2.0])
 def test_density_of_the_squashed_gaussian(log_std: float) -> None:
     """log π(a) = log N(atanh a) - log(1 - a²), in float64 by SciPy."""
@@ -120,6 +156,12 @@ def test_density_of_the_squashed_gaussian(log_std: float) -> None:
         raw = np.arctanh(a)
         expected = stats.norm.logpdf(raw, policy.mean, np.exp(log_std)) - np.log1p(-(a**2))
         np.testing.assert_allclose(log_prob, expected.sum(), rtol=2e-3, atol=2e-2)
+
+
+def test_mode_is_squashed() -> None:
+    np.testing.assert_allclose(
+        networks.mode(networks.Gaussian(jnp.array([0.5, -2.0]), jnp.zeros(2))), np.tanh([0.5, -2])
+    )
 
 
 def test_density_does_not_overflow() -> None:
@@ -145,6 +187,12 @@ def test_torch_default_initialisation() -> None:
     for values in (layer["w"], layer["b"]):
         assert float(jnp.abs(values).max()) <= 1 / 20
         assert abs(float(values.std()) - 1 / 20 / 3**0.5) < 2e-3
+
+
+def test_initialisation_with_a_given_width() -> None:
+    layer = networks.linear_init(jax.random.key(0), 400, 300, 0.02)
+    assert abs(float(layer["w"].std()) - 0.02) < 1e-3
+    assert not layer["b"].any()
 
 
 def test_transformer_initialisation() -> None:

@@ -50,6 +50,7 @@ def test_windows_stay_in_their_episode(delay: int, ahead: int, capacity: int) ->
         np.testing.assert_array_equal(windows.reward[i, acted], (now + offset + 1)[acted])
         assert not windows.reward[i, ~acted].any()
         np.testing.assert_array_equal(windows.terminated[i, acted], (now + offset + 1 == length)[acted])
+        assert not windows.terminated[i, ~acted].any()
         assert windows.lead[i] == expected[delay + 1 :].sum()
         assert 1 <= windows.n_step[i] <= windows.lead[i]
 
@@ -145,6 +146,7 @@ def test_hidden_observations_are_never_given(hidden: int) -> None:
     newest = len(transitions) - hidden
     assert int(windows.obs[..., 0].max()) == newest
     assert int((windows.valid * windows.obs[..., 0]).max()) == newest
+    assert int(windows.lead.min()) == int(windows.n_step.min()) == 1  # the outcome of each has arrived
 
 
 def test_memory_of_humanoid() -> None:

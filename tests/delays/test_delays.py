@@ -128,6 +128,8 @@ def test_channels_of_a_text() -> None:
     assert delay.maximum == 7
     assert delay.observed() == Delay(Channel(uniform(3, 7), "fifo"))
     assert as_delay("paper-stochastic-5").observation == PAPER_STOCHASTIC_5
+    assert Channel(Choice((1, 2, 3, 4, 5), (0.02,) * 4 + (0.92,)), "raw") == PAPER_STOCHASTIC_5
+    assert Channel(uniform(1, 5)).rule == "newest"
     assert str(as_delay("paper-stochastic-5")) == "paper-stochastic-5"
     assert as_delay("paper-stochastic-5@fifo").observation.rule == "fifo"
 

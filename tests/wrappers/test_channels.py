@@ -320,6 +320,58 @@ def test_the_info_of_the_last_step_is_not_repeated() -> None:
     assert sum("episode" in env.step(np.float32([0]))[4] for _ in range(9)) == 1
 
 
+@pytest.mark.parametrize("delay", [0, 2])
+def test_arrays_belong_to_whoever_holds_them(delay: int) -> None:
+    """Neither an environment that reuses its arrays nor an agent that writes into its own changes what is shown."""
+
+    class Reusing(Journal):
+        array = np.zeros(2)
+
+        def reset(self, **options: Any):
+            self.array[:] = super().reset(**options)[0]
+            return self.array, {}
+
+        def step(self, action):
+            obs, *rest = super().step(action)
+            self.array[:] = obs
+            return self.array, *rest
+
+    env = Delayed(Reusing(20), delay)
+    obs, _ = env.reset(seed=0)
+    for t in range(1, 9):
+        obs[:] = 99
+        obs, *_, info = env.step(np.float32([0.5]))
+        assert obs[0] == max(t - delay, 0)
+        info["actions"][:] = 99
+
+
+def test_travel_times_of_another_seed() -> None:
+    one, other = (Delayed(Journal(40), "uniform:0:5") for _ in range(2))
+    one.reset(seed=1)
+    one.draw_from(7)
+    other.reset(seed=7)
+    ages = [[env.step(np.float32([0]))[4]["age"] for _ in range(30)] for env in (one, other)]
+    assert ages[0] == ages[1]
+
+
+class Gas(Journal):
+    action_space = gym.spaces.Box(1, 10, (1,))
+    tau = 0.02
+
+
+def test_actions_without_a_zero() -> None:
+    """The idle action is clipped to the bounds; an empty slot of the augmented state lies in its space."""
+    env = AugmentedObservation(Delayed(Gas(20), "1+action=2", idle=np.array([-5.0])))
+    x, _ = env.reset(seed=0)
+    assert env.observation_space.contains(x.astype(env.observation_space.dtype))
+    env.step(np.float32([3]))
+    assert env.unwrapped.acted == [1.0]  # type: ignore[attr-defined]
+
+
+def test_the_length_of_a_step_may_be_called_tau() -> None:
+    assert Delayed(Gas(20), "40ms").delay == as_delay(2)
+
+
 def test_idle_is_zero_in_the_tasks_units() -> None:
     class Gas(Journal):
         action_space = gym.spaces.Box(0, 10, (1,))
