@@ -94,7 +94,7 @@ def test_round_trip() -> None:
         windows = draw(replay, 3000, delay, 3)
         by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
         for shorter in {None, 0, delay // 2}:
-            views = jax.vmap(lambda w, shorter=shorter: view(w, 0, shorter))(windows)
+            views = jax.jit(jax.vmap(lambda w, shorter=shorter: view(w, 0, shorter)))(windows)
             for i, action in enumerate(np.asarray(windows.action[:, delay, 0]).tolist()):
                 step = by_action[action]
                 known = shown[step]
