@@ -136,7 +136,7 @@ def test_equal_delays_are_a_sac() -> None:
 
     short = agent.improve_auxiliary(state, now, policy_key)
     assert same(short._replace(auxiliary=auxiliary), state)
-    near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, SPEC.action_size, temperature_key), expected)
+    near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, -2.0, temperature_key), expected)
     long = agent.improve_augmented(state, now, policy_key)
     assert same(long.auxiliary, auxiliary)
     near((long.actor, long.actor_opt_state), (expected.actor, expected.actor_opt_state))

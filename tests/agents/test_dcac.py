@@ -234,7 +234,10 @@ def test_the_target_is_of_the_target_critics() -> None:
     for target in (state.target, other):
         y = AGENT.soft_return(rolls, 5.0, 1.0, values(target, rolls.x_last))
         error = ((values(state.critic, rolls.x) - y) ** 2).mean(-1).sum()
-        np.testing.assert_allclose(loss(state.critic, target)["critic_loss"], error, rtol=1e-4)
+        metrics = loss(state.critic, target)
+        np.testing.assert_allclose(metrics["critic_loss"], error, rtol=1e-4)
+        gain = AGENT.soft_return(rolls, 0.0, 1.0, values(state.critic, rolls.x_last)).mean()
+        np.testing.assert_allclose(metrics["actor_loss"], -gain, rtol=1e-4)
 
 
 def test_gradient_reaches_the_first_action() -> None:

@@ -135,6 +135,8 @@ def test_behaviour(behaviour: str, rng: np.random.Generator) -> None:
     """Only `delayed` does without the true state; `lower-q` executes the sample that the critics think less of."""
     agent = dataclasses.replace(TINY["vdpo"], behaviour=behaviour, dropout=0.0)
     state, _ = vdpo_parts(agent)
+    other = agent.reference.init(Spec(OBS, ACT, 0), jax.random.key(9))
+    state = state._replace(reference=state.reference._replace(target=other.target))  # which has no say
     assert agent.privileged == (behaviour != "delayed")
     chosen = {b: [] for b in ("lower-q", "delayed", "reference", "mixture")}
     for seed in range(20):
