@@ -133,6 +133,18 @@ def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, 
     return Setup(condition, override(base.agent, values), schedule, parsed, chosen)
 
 
+def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a run's configuration that differ from its preset's; none if we do not know the preset."""
+    try:
+        registration = find_agent(config["agent"])
+        preset, chosen = registration.presets[config["preset"]], registration.protocol(config["protocol"])
+    except (KeyError, DelayRLError):
+        return {}
+    usual = {k: v for part in preset for k, v in values_of(override(part, chosen.overrides)).items()}
+    options = config["hyperparameters"] | config["schedule"]
+    return {name: value for name, value in options.items() if name not in usual or usual[name] != value}
+
+
 def agent_of(config: Mapping[str, Any]) -> Agent:
     """Make the agent that a run's configuration describes. Raises DelayRLError for an unknown name."""
     try:
