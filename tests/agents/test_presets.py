@@ -1,0 +1,143 @@
+"""The preset `paper` of every agent, held against the tables of its source; and what `matched` has in common."""
+
+import pytest
+
+from delayrl.agents.registry import AGENTS
+from delayrl.run.configuration import values_of
+
+VDPO_SAC = {  # VDPO: appendix, table of hyperparameters; log-std, n-step, actor_updates, start: its released code
+    "hidden": [256, 256],
+    "actor_learning_rate": 3e-4,
+    "critic_learning_rate": 1e-3,
+    "temperature_learning_rate": 1e-3,
+    "initial_temperature": 1.0,
+    "entropy_per_action": -1.0,
+    "entropy_unit": "task",
+    "discount": 0.99,
+    "target_rate": 5e-3,
+    "n_steps": 3,
+    "actor_every": 2,
+    "actor_updates": 2,
+    "log_std_range": [-5.0, 2.0],
+    "log_std_bounds": "rescale",
+    "batch_size": 256,
+    "update_every": 1,
+    "updates": 1,
+}
+BPQL = VDPO_SAC | {  # BPQL: released code, main.py
+    "critic_learning_rate": 3e-4,
+    "temperature_learning_rate": 3e-4,
+    "n_steps": 1,
+    "actor_every": 1,
+    "actor_updates": 1,
+    "log_std_range": [-20.0, 2.0],
+    "log_std_bounds": "clip",
+    "update_every": 50,
+    "updates": 50,
+}
+SCHEDULE = {
+    "steps": 1_000_000,
+    "random_steps": 5_000,
+    "update_after": 0,
+    "replay_capacity": 1_000_000,
+    "evaluate_every": 10_000,
+    "evaluation_episodes": 10,
+    "updates_per_call": 1,
+    "precision": "float32",
+}
+PAPER = {
+    "vdpo": VDPO_SAC
+    | {
+        "representation": "transformer",
+        "width": 256,
+        "layers": 3,
+        "dropout": 0.1,
+        "learning_rate": 3e-4,
+        "clone_every": 1000,
+        "clone_updates": 1000,
+        "direction": "reverse",
+        "behaviour": "lower-q",
+        "at_age_0": "reference",
+    },
+    "ad-sac": VDPO_SAC | {"auxiliary_delay": 0, "behaviour": "lower-q", "evaluation": "mode"},
+    "dida": VDPO_SAC  # student: DIDA's code, train_dida.py; expert_steps and imitation_updates: ours (docs)
+    | {
+        "expert_steps": 500_000,
+        "round_steps": 1000,
+        "imitation_updates": 1000,
+        "student_hidden": [100, 100],
+        "student_optimiser": "rmsprop",
+        "student_learning_rate": 1e-3,
+        "student_decay": 0.9,
+        "student_batch_size": 32,
+    },
+    "dcac": {  # rlrd: sac.py and dcac.py, class Agent
+        "hidden": [256, 256],
+        "learning_rate": 3e-4,
+        "actor_share": 0.2,
+        "reward_scale": 5.0,
+        "temperature": "fixed",
+        "entropy_scale": 1.0,
+        "discount": 0.99,
+        "target_rate": 5e-3,
+        "log_std_range": [-20.0, 2.0],
+        "batch_size": 128,
+    },
+    "bpql": BPQL,
+    "lifting": BPQL  # DHRL: agents/d2hpg_bpql.py
+    | {"initial_temperature": 0.2, "lifting_weight": 10.0, "lifting_hold": 250_000, "lifting_end": 750_000},
+    "a-sac": VDPO_SAC,
+    "sac-memoryless": VDPO_SAC,
+    "sac": VDPO_SAC,
+    "random": {},
+}
+OWN_SCHEDULE = {
+    "bpql": {"random_steps": 10_000, "update_after": 1_000},
+    "lifting": {"random_steps": 10_000, "update_after": 100},
+    "dcac": {"random_steps": 10_000},
+}
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_paper(agent: str) -> None:
+    preset = AGENTS[agent].presets["paper"]
+    assert values_of(preset.agent) == PAPER[agent]
+    assert values_of(preset.schedule) == SCHEDULE | OWN_SCHEDULE.get(agent, {})
+
+
+MATCHED = VDPO_SAC | {
+    "critic_learning_rate": 3e-4,
+    "temperature_learning_rate": 3e-4,
+    "entropy_unit": "scaled",
+    "n_steps": 1,
+    "actor_every": 1,
+    "actor_updates": 1,
+    "log_std_range": [-20.0, 2.0],
+    "log_std_bounds": "clip",
+}
+
+
+@pytest.mark.parametrize("agent", [agent for agent in AGENTS if agent not in ("random", "dcac")])
+def test_matched(agent: str) -> None:
+    """Every option that agents share has one value. AD-SAC has two actors, of which an update improves one."""
+    values = values_of(AGENTS[agent].presets["matched"].agent)
+    shared = MATCHED | ({"actor_updates": 2} if agent == "ad-sac" else {})
+    assert {name: values[name] for name in shared} == shared
+    own = {"learning_rate": 3e-4, "student_learning_rate": 3e-4, "student_hidden": [256, 256]}
+    own |= {"student_batch_size": 256, "student_optimiser": "adam"}
+    assert {name: values[name] for name in own if name in values} == {n: x for n, x in own.items() if n in values}
+    rounds = [("clone_every", "clone_updates"), ("round_steps", "imitation_updates"), ("update_every", "updates")]
+    assert all(values[every] == values[updates] for every, updates in rounds if every in values)
+
+
+def test_matched_dcac() -> None:
+    """It has values of states instead of actions, and one optimiser; all else is shared."""
+    values = values_of(AGENTS["dcac"].presets["matched"].agent)
+    assert {name: values[name] for name in values if name in MATCHED} == {
+        name: x for name, x in MATCHED.items() if name in values
+    }
+    assert (values["learning_rate"], values["temperature"], values["reward_scale"]) == (3e-4, "learned", 1.0)
+
+
+def test_matched_schedules() -> None:
+    assert len({preset.schedule for preset in (entry.presets["matched"] for entry in AGENTS.values())}) == 1
