@@ -141,7 +141,8 @@ def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
     except (KeyError, DelayRLError):
         return {}
     usual = {k: v for part in preset for k, v in values_of(override(part, chosen.overrides)).items()}
-    options = config["hyperparameters"] | config["schedule"]
+    implied = {name: value for name, value in OLDER.items() if name in usual}
+    options = {**implied, **config["hyperparameters"], **config["schedule"]}
     return {name: value for name, value in options.items() if name not in usual or usual[name] != value}
 
 
