@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from delayrl.errors import DelayRLError
-from delayrl.report.configurations import overrides_of, read_configs
+from delayrl.report.configurations import read_configs
 from delayrl.report.markdown import markdown
 from delayrl.report.page import payload
 from delayrl.report.rows import read_rows
 from delayrl.report.summary import Summary, summarise
-from delayrl.run.condition import resolve
+from delayrl.run.condition import overrides_of, resolve
 from delayrl.run.cost import Cost
 from delayrl.run.folder import Run
 
@@ -118,7 +118,7 @@ def test_the_report_says_what_an_agent_costs(tmp_path: Path) -> None:
     config["cost"] |= {"parameters": 1_400_000}
     (tmp_path / "b" / "config.json").write_text(json.dumps(config))
     summary = summary_of(*rows)
-    line = ("bpql", "no", "12.3k to 1.4M", "1 critic; 0.5 actor, temperature", "128", "3.2G")
+    line = ("bpql", "no", "12.3k to 1.4M", "1 × critic; 0.5 × actor, temperature", "128", "3.2G")
     assert f"| {' | '.join(line)} |" in markdown(summary, "t", {})
     assert payload(summary, "t")["costs"] == [[line]]
     assert "Cost of an agent" not in markdown(summary_of(*rows, configs=False), "t", {})

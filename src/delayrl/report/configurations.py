@@ -6,11 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from delayrl.agents.registry import find_agent
 from delayrl.errors import DelayRLError
 from delayrl.report.rows import Key, RowGroup
-from delayrl.run.condition import Condition
-from delayrl.run.configuration import override, values_of
+from delayrl.run.condition import Condition, overrides_of
 from delayrl.run.folder import Run
 
 Config = Mapping[str, Any]
@@ -53,17 +51,3 @@ def distinct_overrides(groups: Sequence[RowGroup]) -> list[dict[str, Any]]:
         own | {"configuration": group.configuration[:8]} if group.configuration and len(alike[name]) > 1 else own
         for group, own, name in zip(groups, overrides, names, strict=True)
     ]
-
-
-def overrides_of(config: Config) -> dict[str, Any]:
-    """Return the options of a configuration that differ from its preset's; none if we do not know the preset."""
-    try:
-        agent = find_agent(config["agent"])
-        preset, protocol = agent.presets[config["preset"]], agent.protocol(config["protocol"])
-    except (KeyError, DelayRLError):
-        return {}
-    base: dict[str, Any] = {}
-    for part in (preset.agent, preset.schedule):
-        base |= values_of(override(part, protocol.overrides))
-    options = config["hyperparameters"] | config["schedule"]
-    return {name: value for name, value in options.items() if name not in base or base[name] != value}

@@ -117,7 +117,7 @@ def costs(summary: Summary, setting: Setting) -> Sequence[tuple[str, ...]]:
     for label in sorted(known, key=agent_order):
         costs = [result.cost for result in known[label] if result.cost]
         steps = " or ".join(dict.fromkeys(_gradient_steps(cost) for cost in costs))
-        batches = " or ".join(dict.fromkeys(", ".join(map(str, cost.batches)) for cost in costs))
+        batches = " or ".join(dict.fromkeys(", ".join(dict.fromkeys(map(str, cost.batches))) for cost in costs))
         sizes = _range([cost.parameters for cost in costs]), _range([cost.flops for cost in costs])
         privileged = "in training" if any(result.privileged for result in known[label]) else "no"
         lines.append((summary.name(label), privileged, sizes[0], steps, batches, sizes[1]))
@@ -129,7 +129,7 @@ def _gradient_steps(cost: Cost) -> str:
     names: dict[float, list[str]] = {}
     for name, number in cost.gradient_steps.items():
         names.setdefault(number, []).append(name)
-    return "; ".join(f"{number:g} {', '.join(alike)}" for number, alike in sorted(names.items(), reverse=True))
+    return "; ".join(f"{number:g} × {', '.join(alike)}" for number, alike in sorted(names.items(), reverse=True))
 
 
 def _range(values: Sequence[float]) -> str:
