@@ -10,6 +10,7 @@ import pytest
 from learning import ACT, ENV, OBS, counted, random_windows, same, seen, trained
 
 from conftest import TINY, TINY_SAC, record
+from delayrl.agents.registry import AGENTS
 from delayrl.agents.sac import SAC, State
 from delayrl.agents.vdpo import VDPO
 from delayrl.core import networks
@@ -39,6 +40,25 @@ def test_views_are_what_the_table_says() -> None:
         assert (actor.shape[1], critic.shape[1]) == sizes
         np.testing.assert_array_equal(actor[:, 0], actor_time)
         np.testing.assert_array_equal(critic[:, 0], critic_time)
+
+
+def test_presets_have_their_views() -> None:
+    """In every preset; the SACs inside other agents too."""
+    views = {
+        "sac": ("current", "current"),
+        "sac-memoryless": ("delayed", "delayed"),
+        "a-sac": ("augmented", "augmented"),
+        "bpql": ("augmented", "current"),
+        "ad-sac": ("augmented", "augmented"),
+        "lifting": ("augmented", "current"),
+        "vdpo": ("current", "current"),
+        "dida": ("current", "current"),
+    }
+    inner = {"ad-sac": "learner", "lifting": "bpql", "vdpo": "reference", "dida": "reference"}
+    for name, pair in views.items():
+        for preset in AGENTS[name].presets.values():
+            agent = getattr(preset.agent, inner[name]) if name in inner else preset.agent
+            assert (agent.actor_sees, agent.critic_sees) == pair
 
 
 def test_memoryless_sees_no_actions(rng: np.random.Generator) -> None:

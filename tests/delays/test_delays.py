@@ -87,6 +87,7 @@ def test_bursts() -> None:
     values = np.array(drawn(gilbert_elliott(0, 1, 0.05, 0.2), 50_000))
     starts = ((values[1:] == 1) & (values[:-1] == 0)).sum()
     assert values.sum() / starts == pytest.approx(5, rel=0.1)
+    np.testing.assert_allclose(random_walk(3).transitions[1], [1 / 3, 1 / 3, 1 / 3, 0])
     steps = np.abs(np.diff(drawn(random_walk(9, 0.5), 20_000)))
     assert set(steps) == {0, 1}
     assert steps.mean() == pytest.approx(0.5 * 0.9, abs=0.02)  # at 2 of 10 states half of the moves are not taken
