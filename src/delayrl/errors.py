@@ -9,6 +9,10 @@ class StoppedError(DelayRLError):
     """A run stopped when asked to. Its newest step is stored; the same call resumes it."""
 
 
+class DelayWarning(UserWarning):
+    """Something that works, but is probably not meant: one line."""
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type where the message is empty."""
     lines = str(error).strip().splitlines()

@@ -203,9 +203,9 @@ def test_worker(finished, tmp_path: Path) -> None:
     with folders.hold(home):
         assert work(home).kind == "locked"
         assert status(grid.cells[0], runs) == "running"
-    wrong = replace(grid.cells[0], id="89ab", condition=replace(grid.cells[0].condition, delay=50))
+    wrong = replace(grid.cells[0], id="89ab", condition=replace(grid.cells[0].condition, delay=51))
     assert work_on(wrong, tmp_path).kind == "failed"
-    assert "no shorter than an episode" in work(tmp_path / wrong.folder).line
+    assert "longer than an episode" in work(tmp_path / wrong.folder).line
     (tmp_path / wrong.folder / "cell.json").write_text("{")
     assert work(tmp_path / wrong.folder).kind == "died"
 

@@ -117,7 +117,7 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train vdpo --env Reacher-v5 --delay -3", "negative"),
         ("train vdpo --env Reacher-v5 --delay 2.5", "whole"),
         ("train vdpo --env Reacher-v5 --delay some", "number"),
-        ("train vdpo --env Reacher-v5 --delay 50", "no shorter than an episode"),
+        ("train vdpo --env Reacher-v5 --delay 51", "longer than an episode"),
         ("train vdpo --env Reacher-v5", "at least 1 step"),
         ("train sac --env Reacher-v5 --delay 3", "delay-free reference"),
         ("train vdpo --env CartPole-v1 --delay 3", "continuous"),

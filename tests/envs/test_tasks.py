@@ -34,10 +34,10 @@ def test_a_task_is_made_only_for_the_length_of_its_steps(monkeypatch: pytest.Mon
         envs.delay_of("Pendulm-v1", "80ms")
 
 
-@pytest.mark.parametrize("delay", [200, "walk:200", "2+reward=200", "150+action=50"])
-def test_no_delay_is_as_long_as_an_episode(delay: int | str) -> None:
+@pytest.mark.parametrize("delay", [201, "walk:201", "2+reward=201", "151+action=50"])
+def test_no_delay_is_longer_than_an_episode(delay: int | str) -> None:
     """Rewards too, which training moves to no environment."""
-    with pytest.raises(delayrl.DelayRLError, match="200 steps is no shorter than an episode of Pendulum-v1"):
+    with pytest.raises(delayrl.DelayRLError, match="201 steps is longer than an episode of Pendulum-v1"):
         envs.delay_of("Pendulum-v1", delay)
     envs.delay_of("delayrl/unknown-v0", delay)  # whoever makes it says so
 

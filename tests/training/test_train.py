@@ -253,3 +253,11 @@ def test_bad_values(values: dict, words: str, tmp_path: Path) -> None:
 def test_unknown_agent() -> None:
     with pytest.raises(delayrl.DelayRLError, match="did you mean vdpo"):
         delayrl.train("vpdo", env="Reacher-v5", delay=3)
+
+
+def test_a_delay_as_long_as_the_episode(tmp_path: Path) -> None:
+    """The agent is blind after the start, and what it did is still learned from."""
+    with pytest.warns(delayrl.errors.DelayWarning, match="nothing after the start"):
+        run = train("a-sac", tmp_path / "run", delay=50, random_steps=110)
+    assert {row["length"] for row in run.read("rows")} == {50}
+    assert run.latest().complete

@@ -9,6 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import delayrl
+from delayrl.errors import DelayWarning
 from delayrl.wrappers import AugmentedObservation, Delayed
 
 
@@ -77,7 +78,7 @@ def test_needs_no_jax() -> None:
 
 @pytest.mark.parametrize(
     ("delay", "words"),
-    [(-1, "negative"), (2.5, "whole"), ("x", "not a number"), (True, "whole"), (50, "no shorter than an episode")],
+    [(-1, "negative"), (2.5, "whole"), ("x", "not a number"), (True, "whole"), (51, "longer than an episode")],
 )
 def test_bad_delays(delay: object, words: str) -> None:
     with pytest.raises(delayrl.DelayRLError, match=words):
@@ -97,3 +98,19 @@ def test_images_and_unbounded_actions() -> None:
         Delayed(Images(), 1)
     with pytest.raises(delayrl.DelayRLError, match="bounded"):
         Delayed(Unbounded(), 1)
+
+
+def test_an_episode_in_which_nothing_is_observed() -> None:
+    """A delay as long as the episode, as the paper's Reacher at 50 steps: s_0 is shown to the end, ever older."""
+    with pytest.warns(DelayWarning, match=r"of 50 steps nothing after the start .* Reacher-v5 \(50 steps\)"):
+        env = delayrl.make("Reacher-v5", 50)
+    observations, infos, actions = rollout(env, 60)
+    assert len(actions) == 50
+    for step, (obs, info) in enumerate(zip(observations, infos, strict=True)):
+        np.testing.assert_array_equal(obs, observations[0])
+        assert info["age"] == step
+        np.testing.assert_array_equal(info["actions"][:step], np.reshape(actions[:step], (step, 2)))
+    with pytest.warns(DelayWarning, match="nothing after the start"):
+        delayrl.make("Reacher-v5", 49)
+    delayrl.make("Reacher-v5", 48)
+    delayrl.make("Reacher-v5", "uniform:1:50")

@@ -2,11 +2,13 @@
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 from delayrl.cli.console import Parser
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 
 COMMANDS = {
     "train": "train an agent, or resume a run",
@@ -26,6 +28,7 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that the words after `delayrl` name; None for the words of the process."""
+    warnings.showwarning = _show_warning
     try:
         _run(list(sys.argv[1:] if arguments is None else arguments))
     except DelayRLError as error:
@@ -38,6 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *place: Any) -> None:
+    """Write a warning of ours as one line; others as Python does."""
+    ours = issubclass(category, DelayWarning)
+    sys.stderr.write(f"delayrl: {message}\n" if ours else warnings.formatwarning(message, category, *place[:2]))
 
 
 def _run(arguments: list[str]) -> None:

@@ -36,7 +36,7 @@ def make(
 
     Args:
         env: an id of Gymnasium's registry, e.g. "InvertedPendulum-v5".
-        delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; shorter than an episode.
+        delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; no longer than an episode.
         rescale: whether actions, in `info` too, are in [-1, 1] instead of the task's own range.
         history: rows of the action history, as `Delayed`.
         fill: what is shown before anything has arrived, as `Delayed`.

@@ -1,5 +1,6 @@
 """The wrapper that delays one environment."""
 
+import warnings
 from typing import Any, SupportsFloat, get_args
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.delays.laws import whole_steps
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.wrappers.transit import Fill, Transit
 
 Info = dict[str, Any]
@@ -41,16 +42,24 @@ def seconds_of(env: Any) -> float | None:
 
 
 def check_length(delay: Delay, spec: Any) -> None:
-    """Raise DelayRLError if a delay is no shorter than an episode of the task with this spec (None: unknown)."""
+    """Raise DelayRLError if a delay is longer than an episode of the task with this spec (None: unknown)."""
     limit = spec.max_episode_steps if spec is not None else None
     longest = max(delay.maximum, delay.reward.maximum)
-    if limit is not None and longest >= limit:
-        raise DelayRLError(f"a delay of {longest} steps is no shorter than an episode of {spec.id} ({limit} steps)")
+    if limit is not None and longest > limit:
+        raise DelayRLError(f"a delay of {longest} steps is longer than an episode of {spec.id} ({limit} steps)")
 
 
 def history_rows(env: Any, delay: Delay, history: int | None) -> int:
     """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
     check_length(delay, env.spec)
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    if limit is not None and delay.observation.constant and delay.maximum >= limit - 1:
+        warnings.warn(
+            f"with a delay of {delay.maximum} steps nothing after the start of an episode of {env.spec.id} "
+            f"({limit} steps) is ever observed: the agent acts on s_0 and its own actions alone",
+            DelayWarning,
+            stacklevel=3,
+        )
     if history is None:
         return delay.maximum
     if whole_steps(history) < delay.maximum:
