@@ -28,7 +28,7 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that the words after `delayrl` name; None for the words of the process."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         _run(list(sys.argv[1:] if arguments is None else arguments))
     except DelayRLError as error:
@@ -43,10 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *place: Any) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any) -> None:
     """Write a warning of ours as one line; others as Python does."""
     ours = issubclass(category, DelayWarning)
-    sys.stderr.write(f"delayrl: {message}\n" if ours else warnings.formatwarning(message, category, *place[:2]))
+    sys.stderr.write(f"delayrl: {message}\n" if ours else warnings.formatwarning(message, category, filename, lineno))
 
 
 def _run(arguments: list[str]) -> None:
