@@ -15,6 +15,7 @@ from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.wrappers.transit import Fill, Transit
 
 Info = dict[str, Any]
+_warned: set[str] = set()  # training makes the same task many times
 
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
@@ -54,12 +55,11 @@ def history_rows(env: Any, delay: Delay, history: int | None) -> int:
     check_length(delay, env.spec)
     limit = env.spec.max_episode_steps if env.spec is not None else None
     if limit is not None and delay.observation.constant and delay.maximum >= limit - 1:
-        warnings.warn(
-            f"with a delay of {delay.maximum} steps nothing after the start of an episode of {env.spec.id} "
-            f"({limit} steps) is ever observed: the agent acts on s_0 and its own actions alone",
-            DelayWarning,
-            stacklevel=3,
-        )
+        line = f"with a delay of {delay.maximum} steps nothing after the start of an episode of {env.spec.id} "
+        line += f"({limit} steps) is ever observed: the agent acts on s_0 and its own actions alone"
+        if line not in _warned:
+            _warned.add(line)
+            warnings.warn(line, DelayWarning, stacklevel=3)
     if history is None:
         return delay.maximum
     if whole_steps(history) < delay.maximum:
