@@ -254,6 +254,7 @@ def test_auxiliary_delay_is_not_longer() -> None:
         ADSAC(TINY, DELAY + 1).init(SPEC, jax.random.key(0))
 
 
+@pytest.mark.thorough
 def test_the_loop_repeats_itself() -> None:
     """Through the jitted loop, τ = 1: the same seed twice ends with the same parameters, all of them finite."""
     agent, _ = started(1)

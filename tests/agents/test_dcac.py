@@ -287,6 +287,7 @@ def test_act() -> None:
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
 
 
+@pytest.mark.thorough
 def test_learning_never_peeks() -> None:
     """In the loop: what has not arrived may be anything, the learner ends with the same parameters."""
     data, _ = record("Reacher-v5", 3, 40)

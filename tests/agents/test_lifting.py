@@ -241,6 +241,7 @@ def run(transitions, hidden: int):
     return learner.agent
 
 
+@pytest.mark.thorough
 def test_the_loop_repeats_itself_and_never_peeks() -> None:
     """The same seed twice is the same; and what has not arrived may be anything."""
     transitions, _ = record(ENV, DELAY, 40)

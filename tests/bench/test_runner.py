@@ -153,6 +153,7 @@ exit $status
 """
 
 
+@pytest.mark.thorough
 def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
     """A full disk fails with one line and is not tried again; with room the grid resumes without loss."""
     file, expected = undisturbed

@@ -44,6 +44,7 @@ def test_a_run_is_loaded(stopped: Path) -> None:
     assert np.isfinite(action).all()
 
 
+@pytest.mark.thorough
 def test_a_run_is_resumed(stopped: Path) -> None:
     before = Run(stopped).read("rows")
     run = delayrl.train("vdpo", "InvertedPendulum-v5", out=stopped, progress=False, **OPTIONS)

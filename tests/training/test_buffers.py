@@ -64,6 +64,7 @@ def test_no_fresh_pages() -> None:
     assert int(python(FAULTS, "kept")) < 500
 
 
+@pytest.mark.thorough
 def test_no_result_changes(tmp_path: Path) -> None:
     words = {"steps": 60, "evaluate_every": 30, "random_steps": 20, "evaluation_episodes": 1, "progress": False}
     code = """

@@ -78,6 +78,7 @@ def test_killed_at_random_moments(agent: str, trial: int, tmp_path: Path, whole)
     assert_same(agent, tmp_path / "cut", runs)
 
 
+@pytest.mark.thorough
 def test_killed_between_the_first_checkpoints_of_a_group(tmp_path: Path, whole) -> None:
     """One seed has a checkpoint, the other none; and then killed at each moment of starting afresh."""
     out = tmp_path / "cut"
@@ -145,7 +146,10 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
     assert not (run.path / "replay").exists()
 
 
-@pytest.mark.parametrize(("agent", "block"), [("bpql", 1), ("bpql", 4), ("vdpo", 10)])
+@pytest.mark.parametrize(
+    ("agent", "block"),
+    [("bpql", 4), *(pytest.param(*of, marks=pytest.mark.thorough) for of in [("bpql", 1), ("vdpo", 10)])],
+)
 def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_path: Path, monkeypatch) -> None:
     """A run that is asked to stop keeps its newest steps and goes on with them, bit for bit."""
     values = {"updates_per_call": block}
