@@ -128,7 +128,7 @@ def _gradient_steps(cost: Cost) -> str:
     """Write how often each optimiser steps; those that step alike are together."""
     names: dict[float, list[str]] = {}
     for name, number in cost.gradient_steps.items():
-        names.setdefault(number, []).append(name)
+        names.setdefault(float(f"{number:.2g}"), []).append(name)
     return "; ".join(f"{number:g} × {', '.join(alike)}" for number, alike in sorted(names.items(), reverse=True))
 
 
