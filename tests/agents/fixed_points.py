@@ -155,7 +155,7 @@ def actor_critic_fixed_point(
     ends_in = np.eye(unmet.shape[1])[windows.shorter].T  # (Z, Y)
     q, _ = soft_optimal(augment(mdp, shorter).mdp, temperature)
     policy = softmax(unmet @ q / temperature)
-    for _ in range(1000):
+    for attempt in range(1000):
         late, free = policy[windows.augmented], softmax(q / temperature)[windows.shorter]
         acting = behaviour(data, q[windows.shorter], free, late)
         met = ends_in * occupancy(windows.mdp, acting)
@@ -172,8 +172,9 @@ def actor_critic_fixed_point(
         updated = softmax(state_law_in_data(windows, acting, unmet) @ q / temperature)
         if max(np.abs(q - before).max(), np.abs(updated - policy).max()) < 1e-11:
             return ActorCritic(q, updated)
-        policy = 0.5 * (policy + updated)
-    raise RuntimeError("critic, policy and data did not settle")
+        policy = policy + (updated - policy) * (0.5 if attempt < 100 else 0.05)  # undamped, data and policy can cycle
+    gap = np.abs(updated - policy).max()
+    raise RuntimeError(f"critic, policy and data did not settle: {gap:.1e}")
 
 
 def lower_value(q: Array, late: Array, temperature: float) -> Array:
