@@ -1,4 +1,4 @@
-.PHONY: sync check test test-all docs bench
+.PHONY: sync check test test-all mutants docs bench
 
 sync:      ## install the package and everything for development
 	pip install -e '.[dev]'
@@ -13,6 +13,9 @@ test:      ## at least one test of everything, in minutes
 
 test-all:  ## all tests but those that train for minutes (pytest -m slow)
 	pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow'
+
+mutants:   ## small mistakes in the code that the tests must notice; MUTANTS='--only agents-sac' chooses
+	python benchmarks/mutants/run.py $(MUTANTS)
 
 docs:      ## build the documentation; a broken link is an error
 	mkdocs build --strict
