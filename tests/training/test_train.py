@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import delayrl
+from conftest import quick
 from delayrl.play.evaluation import Evaluator
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
@@ -39,10 +40,11 @@ def test_same_seed_same_run(vdpo: Run, tmp_path: Path) -> None:
     assert other.read("rows")[0]["return"] != vdpo.read("rows")[0]["return"]
 
 
-def test_threads_change_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("agent", quick(["bpql", "vdpo"], "bpql"))
+def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
     """Two seeds and their evaluations stepped by three threads: rows and parameters of each as ever."""
-    alone = train("vdpo", tmp_path / "alone", seeds=2)
-    beside = train("vdpo", tmp_path / "beside", seeds=2, threads=3)
+    alone = train(agent, tmp_path / "alone", seeds=2)
+    beside = train(agent, tmp_path / "beside", seeds=2, threads=3)
     for one, other in zip(alone, beside, strict=True):
         assert one.read("rows") == other.read("rows")
         for name, array in arrays(one).items():
