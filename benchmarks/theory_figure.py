@@ -321,9 +321,7 @@ def fixed_point_numbers() -> None:
 
 
 def minimum_numbers(count: int = 4) -> None:
-    heading(
-        f"AD-SAC without auxiliary delay, {count} random MDPs, delay 2, temperature 0.3; then the same without noise"
-    )
+    heading(f"AD-SAC without auxiliary delay, {count} random MDPs, delay 2, temperature 0.3; then without noise")
     print(" " * 4 + "policy: from Eq. (11), from BPQL; Q: highest and lowest below Q*, highest below BPQL's; returns:")
     print(" " * 4 + "Eq. (11), BPQL, AD-SAC, AD-SAC on argmin data, best delayed policy")
     for seed, deterministic in product(range(count), (False, True)):
@@ -338,6 +336,14 @@ def minimum_numbers(count: int = 4) -> None:
         policies = (reverse, bpql.policy, adsac.policy, released.policy)
         returns = [tab.policy_return(delayed.mdp, policy) for policy in policies]
         row(f"seed {seed}", [*gaps, *values, *returns, tab.optimal_return(delayed.mdp)])
+
+
+def released_adsac(mdp: tab.MDP, delay: int, temperature: float) -> Array | None:
+    """Return AD-SAC's policy on the data of its released rule for acting; None where policy and data only cycle."""
+    try:
+        return fix.adsac_fixed_point(mdp, delay, temperature, data="lower_q").policy
+    except RuntimeError:
+        return None
 
 
 def random_mdps(axes: Any, count: int = 50) -> None:
@@ -355,13 +361,11 @@ def random_mdps(axes: Any, count: int = 50) -> None:
         def imitate(data: fix.Data, forward: bool, mdp: tab.MDP = mdp) -> Array:
             return fix.imitation_fixed_point(mdp, delay, temperature, data=data, forward=forward)
 
-        policies = {
+        policies: dict[str, Array | None] = {
             "A-SAC": tab.soft_optimal(delayed.mdp, temperature)[1],
             "BPQL": fix.bpql_fixed_point(mdp, delay, temperature).policy,
             "AD-SAC, auxiliary delay 1": fix.adsac_fixed_point(mdp, delay, temperature, shorter=1).policy,
-            "AD-SAC, auxiliary delay 0,\nargmin data (as released)": fix.adsac_fixed_point(
-                mdp, delay, temperature, data="lower_q"
-            ).policy,
+            "AD-SAC, auxiliary delay 0,\nargmin data (as released)": released_adsac(mdp, delay, temperature),
             "AD-SAC, auxiliary delay 0,\nown data": fix.adsac_fixed_point(mdp, delay, temperature).policy,
             "reverse, own data": imitate("delayed", False),
             "reverse, argmin data\n(as released VDPO)": imitate("lower_q", False),
@@ -370,6 +374,8 @@ def random_mdps(axes: Any, count: int = 50) -> None:
             "forward, reference's data\n(Eq. 6)": imitate("reference", True),
         }
         for label, policy in policies.items():
+            if policy is None:
+                continue
             likeliest = np.eye(3)[policy.argmax(axis=1)]
             for where, acting in ((scores, policy), (modes, likeliest)):
                 score = (tab.policy_return(delayed.mdp, acting) - uniform) / (best - uniform)
@@ -378,10 +384,11 @@ def random_mdps(axes: Any, count: int = 50) -> None:
     for label, values in scores.items():
         columns = [float(f(v)) for v in (values, modes[label]) for f in (np.mean, np.median, np.min)]
         row(label.replace("\n", " "), columns)
+    print(f"number of MDPs in each row: {[len(values) for values in scores.values()]}")
     jitter = np.random.default_rng(0).uniform(-0.22, 0.22, size=count)
     for place, (label, values) in enumerate(scores.items()):
         colour = ORANGE if label.startswith("forward") else BLUE if label.startswith("reverse") else GREEN
-        axes.scatter(values, place + jitter, s=11, color=colour, alpha=0.45, lw=0)
+        axes.scatter(values, place + jitter[: len(values)], s=11, color=colour, alpha=0.45, lw=0)
         axes.plot([np.mean(values)] * 2, [place - 0.36, place + 0.36], color=colour, lw=2.5)
         axes.plot(np.mean(modes[label]), place, marker="D", ms=6, mfc="white", mec=colour, mew=1.5, ls="none")
     axes.axvline(1, color="black", lw=0.8, ls=":")

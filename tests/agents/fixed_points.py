@@ -149,13 +149,17 @@ def actor_critic_fixed_point(
         shorter: Auxiliary delay τ, in steps.
         data: Who acts, with π_τ for the reference.
         lower: Take for V the lower of both actors' values (`lower_value`), else that of π_Δ alone.
+
+    Raises:
+        RuntimeError: No fixed point was found. The behaviour "lower_q" jumps where two Q-values cross, so that for some
+            MDPs none exists.
     """
     windows = window_process(mdp, delay, shorter)
     unmet = shorter_histories(mdp, delay, shorter)
     ends_in = np.eye(unmet.shape[1])[windows.shorter].T  # (Z, Y)
     q, _ = soft_optimal(augment(mdp, shorter).mdp, temperature)
     policy = softmax(unmet @ q / temperature)
-    for attempt in range(1000):
+    for attempt in range(300):
         late, free = policy[windows.augmented], softmax(q / temperature)[windows.shorter]
         acting = behaviour(data, q[windows.shorter], free, late)
         met = ends_in * occupancy(windows.mdp, acting)
@@ -173,8 +177,7 @@ def actor_critic_fixed_point(
         if max(np.abs(q - before).max(), np.abs(updated - policy).max()) < 1e-11:
             return ActorCritic(q, updated)
         policy = policy + (updated - policy) * (0.5 if attempt < 100 else 0.05)  # undamped, data and policy can cycle
-    gap = np.abs(updated - policy).max()
-    raise RuntimeError(f"critic, policy and data did not settle: {gap:.1e}")
+    raise RuntimeError("critic, policy and data did not settle")
 
 
 def lower_value(q: Array, late: Array, temperature: float) -> Array:

@@ -239,12 +239,12 @@ def test_the_auxiliary_actor_is_soft_greedy_for_the_shared_critics() -> None:
 
 @pytest.mark.parametrize("name", list(AGENTS))
 def test_critics_take_one_step_from_the_target_critics(name: str) -> None:
-    """Targets that say 3 and 5 everywhere and never move: Q = r + γ V, V the least of what the agent compares."""
+    """Targets that say 7 and 9 everywhere and never move: Q = r + γ V, V the least of what the agent compares."""
     agent, batch = AGENTS[name], windows(0 if name == "sac" else 1)
     state = agent.init(Spec(STATES, 1, batch.delay), jax.random.key(1))
     own = state.auxiliary if name == "ad-sac" else state
     target = [jax.tree.map(jnp.zeros_like, critic) for critic in own.target]
-    for critic, value in zip(target, (3.0, 5.0), strict=True):
+    for critic, value in zip(target, (7.0, 9.0), strict=True):
         critic[-1]["b"] += value
     own = own._replace(target=target, actor=jax.tree.map(jnp.zeros_like, own.actor))  # a Gaussian N(0, 1), everywhere
     late = jax.tree.map(jnp.zeros_like, state.actor)
@@ -252,9 +252,9 @@ def test_critics_take_one_step_from_the_target_critics(name: str) -> None:
     agent = with_options(agent, target_rate=0.0, actor_learning_rate=0.0)
     state = run(agent.phases()[0].update, state, batch, 400)
     own = state.auxiliary if name == "ad-sac" else state
-    soft = np.asarray([3.0, 5.0])[:, None] - TEMPERATURE * np.asarray(act(Policy(jnp.zeros(1), jnp.zeros(1)))[1])
+    soft = np.asarray([7.0, 9.0])[:, None] - TEMPERATURE * np.asarray(act(Policy(jnp.zeros(1), jnp.zeros(1)))[1])
     value = np.minimum(soft[0][:, None], soft[1]).mean() if name == "ad-sac" else soft[0].mean()
-    np.testing.assert_allclose(q_table(own.critic), [reward(ACTIONS) + DISCOUNT * value] * 2, atol=0.3)
+    np.testing.assert_allclose(q_table(own.critic), [reward(ACTIONS) + DISCOUNT * value] * 2, atol=0.5)
 
 
 # ---- Imitation ---------------------------------------------------------------------------------------------
