@@ -11,6 +11,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
+from learning import curves as learning
 from speed import tables as speed
 
 from delayrl.cli.main import main as delayrl
@@ -261,6 +262,8 @@ def main() -> None:
     draw_udp(udp, images / "udp.png")
     if (HERE / "results" / "first.sqlite").exists():
         insert(root / "README.md", "first", first(root))
+    if list((HERE / "results" / "learning").glob("*.jsonl")):
+        insert(root / "docs" / "benchmarks.md", "learning", learning.section(HERE / "results" / "learning", images / "learning.png"))
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)
 

@@ -2,7 +2,7 @@
 
 It runs in an environment with that library, without delayrl:
 
-    pip install torch==2.13.0 stable-baselines3 sbx-rl 'gymnasium[mujoco]'
+    pip install torch==2.13.0 stable-baselines3 sbx-rl 'gymnasium[mujoco]' mujoco==3.17.0
 
 Settings are the library's defaults (256 x 256, batch 256, 3e-4, one update a step), with 5,000 random steps. Every
 5,000 steps it plays ten deterministic episodes, from the start states that `delayrl train` draws for the same seed.
