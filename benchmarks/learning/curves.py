@@ -1,0 +1,101 @@
+"""The base beside other libraries' SAC: reads the rows of both, compares areas under curves, draws them."""
+
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import pyplot
+
+from delayrl.report import statistics
+
+COLOURS = {"delayrl": "#1f6feb", "SBX": "#d1242f", "Stable-Baselines3": "#1a7f37", "delayrl, paper": "#8250df"}
+COLOURS["delayrl, small"] = "#9a6700"
+PEERS = {"sbx": "SBX", "sb3": "Stable-Baselines3"}
+Runs = dict[str, dict[str, dict[int, dict[int, float]]]]  # task -> who -> seed -> step -> mean return
+
+
+def read(folder: Path) -> tuple[Runs, list[str]]:
+    """Return the mean return of each evaluation of each run, and the versions that made them, in words."""
+    runs: Runs = defaultdict(lambda: defaultdict(dict))
+    versions: dict[str, set[str]] = defaultdict(set)
+    for file in sorted(folder.glob("*.jsonl")):
+        lines = [json.loads(line) for line in file.read_text().splitlines()]
+        configs = {line.get("run", 0): line for line in lines if "config" in line}
+        episodes: dict[tuple[int, int], list[float]] = defaultdict(list)
+        for line in lines:
+            if "step" in line and line.get("policy", "agent") == "agent":
+                episodes[line.get("run", 0), line["step"]].append(line["return"])
+        for (run, step), returns in episodes.items():
+            config = configs[run]["config"]
+            runs[config["env"]][name(config)].setdefault(config["seed"], {})[step] = float(np.mean(returns))
+        for line in configs.values():
+            used = line.get("versions") or line["config"]["versions"]
+            packages = ("jax", "torch", "stable-baselines3", "sbx-rl", "mujoco", "gymnasium")
+            words = ", ".join(f"{package} {used[package]}" for package in packages if used.get(package))
+            versions[name(line["config"])].add(f"{words}; {used['cores']} x86 cores")
+    return runs, [f"{who}: {'; '.join(sorted(words))}" for who, words in sorted(versions.items())]
+
+
+def name(config: dict[str, Any]) -> str:
+    """Return who trained: a library, with the preset where it is not the standard settings."""
+    if "library" in config:
+        return PEERS[config["library"]]
+    if config["preset"] == "small":
+        return "delayrl, small"
+    return "delayrl" if config["hyperparameters"]["n_steps"] == 1 else "delayrl, paper"
+
+
+def table(runs: Runs) -> str:
+    """Return a Markdown table: final return and area by task and library, and how much larger our area is."""
+    head = ["task", "SAC of", "seeds", "mean return over training", "after training", "ours less theirs, 95 % interval"]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    for task, by_name in sorted(runs.items()):
+        areas = {}
+        for who in sorted(by_name, key=list(COLOURS).index):
+            steps, returns = statistics.common_steps([by_name[who][seed] for seed in sorted(by_name[who])])
+            areas[who] = statistics.area(steps, returns)
+            cells = [task, who, str(len(returns)), spread(areas[who]), spread(returns[:, -1])]
+            lines.append("| " + " | ".join([*cells, difference(areas.get("delayrl"), areas[who], who)]) + " |")
+    return "\n".join(lines)
+
+
+def spread(values: statistics.Floats) -> str:
+    """Write mean ± standard deviation."""
+    mean, std = statistics.mean_std(values)
+    return f"{mean:,.0f}" + ("" if np.isnan(std) else f" ± {std:,.0f}")
+
+
+def difference(ours: statistics.Floats | None, theirs: statistics.Floats, who: str) -> str:
+    """Write the difference of the means with a bootstrap interval over the seeds of both."""
+    if ours is None or who == "delayrl" or min(ours.size, theirs.size) < 2:
+        return ""
+    random = np.random.default_rng(0)
+    drawn = [x[random.integers(x.size, size=(10_000, x.size))].mean(1) for x in (ours, theirs)]
+    low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5])
+    return f"{ours.mean() - theirs.mean():+,.0f} ({low:+,.0f} to {high:+,.0f})"
+
+
+def draw(runs: Runs, out: Path) -> None:
+    """Draw return against steps: the mean over seeds, and a thin line for each seed, a panel for each task."""
+    figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 3.8), layout="constrained", squeeze=False)
+    for axes, (task, by_name) in zip(panels[0], sorted(runs.items()), strict=True):
+        for who in sorted(by_name, key=list(COLOURS).index):
+            steps, returns = statistics.common_steps(list(by_name[who].values()))
+            axes.plot(steps, returns.T, color=COLOURS[who], alpha=0.2, linewidth=0.8)
+            axes.plot(steps, returns.mean(0), color=COLOURS[who], linewidth=2.2, label=f"{who}, {len(returns)} seeds")
+        axes.set(xlabel="environment steps", ylabel="return", title=f"{task}, no delay")
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(out, dpi=130)
+    pyplot.close(figure)
+
+
+def section(folder: Path, picture: Path) -> str:
+    """Draw the picture, and return the table with what made it."""
+    runs, versions = read(folder)
+    draw(runs, picture)
+    made = "\n".join(f"- {line}" for line in versions)
+    return f"{table(runs)}\n\nRows: `benchmarks/results/learning/`. Made with:\n\n{made}"
