@@ -138,10 +138,10 @@ def test_it_asks_for_what_it_needs() -> None:
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
     with pytest.raises(DelayRLError, match="a multiple of round_steps = 10; got 25"):
         dataclasses.replace(AGENT, expert_steps=25).init(SPEC, jax.random.key(0))
-    AGENT.check(Schedule(steps=21, random_steps=19))
+    AGENT.for_run(Schedule(steps=21, random_steps=19))
     for schedule in (Schedule(steps=20, random_steps=5), Schedule(steps=40, random_steps=20)):
         with pytest.raises(DelayRLError, match="must lie between"):
-            AGENT.check(schedule)
+            AGENT.for_run(schedule)
 
 
 def test_under_the_loop() -> None:

@@ -225,9 +225,9 @@ def test_it_acts_by_the_delayed_policy() -> None:
 
 
 def test_hold_is_before_end() -> None:
-    Lifting(lifting_end=800_000).check(Schedule(steps=800_000))
+    Lifting(lifting_end=800_000).for_run(Schedule(steps=800_000))
     with pytest.raises(DelayRLError, match="no later than steps, 800000; got 800001"):
-        Lifting(lifting_end=800_001).check(Schedule(steps=800_000))
+        Lifting(lifting_end=800_001).for_run(Schedule(steps=800_000))
     with pytest.raises(DelayRLError, match="no later than lifting_end = 750000; got 800000"):
         Lifting(lifting_hold=800_000).init(SPEC, jax.random.key(0))
 

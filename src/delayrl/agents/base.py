@@ -67,7 +67,8 @@ class Agent(Protocol):
     def phases(self) -> tuple[Phase, ...]:
         """Return the agent's updates, each with its schedule."""
 
-    # An agent that restricts the run's schedule also has `check(schedule)`, which raises DelayRLError.
+    # An agent that depends on the run's schedule also has `for_run(schedule)`, which returns the agent for such a run,
+    # or raises DelayRLError.
 
     def init(self, spec: Spec, key: Key) -> State:
         """Return a fresh state. Raises DelayRLError if the agent does not support the task."""

@@ -12,7 +12,7 @@ Deviations from the paper and from the released code are numbered in docs/algori
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -68,13 +68,14 @@ class DIDA:
         """Return the expert."""
         return self.reference, state.reference
 
-    def check(self, schedule: Schedule) -> None:
-        """Raise DelayRLError unless the expert finishes after the random steps and before the end of the run."""
+    def for_run(self, schedule: Schedule) -> Self:
+        """Return the agent. Raises DelayRLError unless the expert finishes between the random steps and the end."""
         if not schedule.random_steps < self.expert_steps < schedule.steps:
             raise DelayRLError(
                 f"expert_steps must lie between random_steps and steps, {schedule.random_steps} and {schedule.steps}; "
                 f"got {self.expert_steps}"
             )
+        return self
 
     def init(self, spec: Spec, key: Key) -> State:
         """Initialise expert and student."""

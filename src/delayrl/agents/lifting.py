@@ -12,8 +12,9 @@ and every log-std in [-20, 2]; 100 samples are off by 1e-1.
 Deviations from the paper and from the released code are numbered in docs/algorithms/lifting.md.
 """
 
+import functools
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -66,13 +67,14 @@ class Lifting:
         """Return the delay-free SAC towards which the delayed policy is pulled."""
         return self.reference, state.reference
 
-    def check(self, schedule: Schedule) -> None:
-        """Raise DelayRLError unless the weight reaches 0 by the end of the run."""
+    def for_run(self, schedule: Schedule) -> Self:
+        """Return the agent. Raises DelayRLError unless the weight reaches 0 by the end of the run."""
         if self.lifting_end > schedule.steps:
             raise DelayRLError(
                 f"lifting_end must be no later than steps, {schedule.steps}; got {self.lifting_end} "
                 "(the original holds the weight for a quarter of the run, and ends at three quarters)"
             )
+        return self
 
     def init(self, spec: Spec, key: Key) -> State:
         """Initialise both SACs."""
@@ -101,9 +103,10 @@ class Lifting:
         towards = self.bpql.policy(reference.actor, windows.obs[:, windows.delay])
         weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
         before = self.bpql.policy(state.delayed.actor, jax.vmap(lambda window: look(window, "augmented"))(windows))
-        delayed, metrics = self.bpql.update(
-            state.delayed, windows, delayed_key, count, lambda policy: weight * lifting_loss(policy, towards)
+        improve = functools.partial(
+            self.bpql.improve_actor, penalty=lambda policy: weight * lifting_loss(policy, towards)
         )
+        delayed, metrics = self.bpql.update(state.delayed, windows, delayed_key, count, improve)
         state = State(delayed, reference._replace(log_temperature=delayed.log_temperature))
         return state, metrics | {
             "lifting_loss": lifting_loss(before, towards),

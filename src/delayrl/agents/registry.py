@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from delayrl.agents.adsac import ADSAC
+from delayrl.agents.any_age import AnyAge
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.dcac import DCAC
 from delayrl.agents.dida import DIDA
@@ -101,7 +102,14 @@ _SMALL_BPQL = replace(_SMALL_SAC, actor_sees="augmented")
 _SMALL_VDPO = VDPO(_SMALL_SAC, width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250)
 _SMALL_DIDA = DIDA(_SMALL_SAC, expert_steps=10_000, round_steps=250, imitation_updates=250)
 
+_LAYER_NORMED = replace(_MATCHED_BPQL, critic_norm="layer")
+
 AGENTS: dict[str, Registration] = {
+    "any-age": Registration(
+        "BPQL whose actor learns at two ages of one moment, the older pulled towards the younger",
+        "-",
+        _presets(AnyAge(_LAYER_NORMED), AnyAge(_LAYER_NORMED), AnyAge(replace(_SMALL_BPQL, critic_norm="layer"))),
+    ),
     "vdpo": Registration(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from delayrl.agents.base import Agent, Deterministic, Phase, descend
 from delayrl.core import networks
-from delayrl.core.networks import Gaussian, LogStdBounds, Params
+from delayrl.core.networks import Gaussian, LogStdBounds, Norm, Params
 from delayrl.core.objectives import k_step_return, soft_target, soft_value, temperature_loss
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import Sees, input_size, look, network_input
@@ -45,6 +45,8 @@ class State(NamedTuple):
 
 
 EntropyUnit = Literal["scaled", "task"]
+ImproveActor = Callable[[State, Array, Array, Key], State]
+"""One step of the actor, given the inputs of actor and critics: agents built on SAC may have their own."""
 Penalty = Callable[[Gaussian], Array]
 """A term that agents built on SAC add to the actor's loss: a function of its policy on the batch."""
 
@@ -61,6 +63,7 @@ class SAC:
     actor_sees: Annotated[Sees, "fixed"] = "current"
     critic_sees: Annotated[Sees, "fixed"] = "current"
     hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
+    critic_norm: Annotated[Norm, "norm of the critics' hidden layers, before their ReLU"] = "none"
     actor_learning_rate: Annotated[float, "Adam's step size for the actor", (0.0, 1.0)] = 3e-4
     critic_learning_rate: Annotated[float, "Adam's step size for the critics", (0.0, 1.0)] = 1e-3
     temperature_learning_rate: Annotated[float, "Adam's step size for the temperature", (0.0, 1.0)] = 1e-3
@@ -103,7 +106,7 @@ class SAC:
         sizes = (input_size(spec, self.actor_sees), *self.hidden, 2 * spec.action_size)
         actor = networks.mlp_init(actor_key, sizes)
         sizes = (input_size(spec, self.critic_sees) + spec.action_size, *self.hidden, 1)
-        critic = networks.twin_init(critic_key, sizes)
+        critic = networks.twin_init(critic_key, sizes, self.critic_norm)
         log_temperature = jnp.log(jnp.asarray(self.initial_temperature, jnp.float32))
         return State(
             actor,
@@ -129,9 +132,18 @@ class SAC:
         return Deterministic(self.actor_sees, state.actor)
 
     def update(
-        self, state: State, windows: Window, key: Key, count: Int[Array, ""], penalty: Penalty = no_penalty
+        self,
+        state: State,
+        windows: Window,
+        key: Key,
+        count: Int[Array, ""],
+        improve_actor: ImproveActor | None = None,
     ) -> tuple[State, Metrics]:
-        """Update the critics and, every `actor_every`-th time, the actor and the temperature on the same batch."""
+        """Update the critics and, every `actor_every`-th time, the actor and the temperature on the same batch.
+
+        `improve_actor` takes the place of SAC's own.
+        """
+        improve_actor = improve_actor or self.improve_actor
         target_key, actor_key = jax.random.split(key)
         actor_now, critic_now = self._inputs(windows, 0)
         actor_next, critic_next = self._inputs(windows, windows.n_step)
@@ -145,7 +157,7 @@ class SAC:
         def improve(state: State) -> State:
             for update_key in jax.random.split(actor_key, self.actor_updates):
                 policy_key, temperature_key = jax.random.split(update_key)
-                state = self.improve_actor(state, actor_now, critic_now, policy_key, penalty)
+                state = improve_actor(state, actor_now, critic_now, policy_key)
                 state = self.adjust_temperature(state, actor_now, self.target_entropy(windows), temperature_key)
             return state
 

@@ -14,6 +14,7 @@ from delayrl.core.types import Key
 Params = Any
 """A pytree (dicts and lists) of arrays."""
 LogStdBounds = Literal["rescale", "clip"]
+Norm = Literal["none", "layer"]
 
 
 class Gaussian(NamedTuple):
@@ -39,8 +40,19 @@ def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*b
     return (rows @ w).reshape(*x.shape[:-1], -1) + params["b"]
 
 
-def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None) -> Params:
-    """Initialise linear layers from sizes[0] inputs to sizes[-1] outputs.
+def layer_norm_init(width: int) -> Params:
+    """Return a scale of 1 and a shift of 0."""
+    return {"scale": jnp.ones(width), "shift": jnp.zeros(width)}
+
+
+def layer_norm(params: Params, x: Float[Array, "*batch width"]) -> Float[Array, "*batch width"]:
+    """Normalise the last axis (ε = 1e-5), then scale and shift it."""
+    centred = x - x.mean(-1, keepdims=True)
+    return centred * jax.lax.rsqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * params["scale"] + params["shift"]
+
+
+def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None, norm: Norm = "none") -> Params:
+    """Initialise linear layers from sizes[0] inputs to sizes[-1] outputs; with a norm after each but the last.
 
     Weights and biases are uniform within 1/√inputs (PyTorch's default); with `std`, weights are N(0, std²), biases 0.
     """
@@ -49,7 +61,10 @@ def mlp_init(key: Key, sizes: tuple[int, ...], std: float | None = None) -> Para
     matrices, biases = weights[: len(shapes)], weights[len(shapes) :]
     if std:
         return [{"w": std * w, "b": jnp.zeros_like(b)} for w, b in zip(matrices, biases, strict=True)]
-    return [{"w": w * len(w) ** -0.5, "b": b * len(w) ** -0.5} for w, b in zip(matrices, biases, strict=True)]
+    layers = [{"w": w * len(w) ** -0.5, "b": b * len(w) ** -0.5} for w, b in zip(matrices, biases, strict=True)]
+    if norm == "layer":
+        layers[:-1] = [layer | {"norm": layer_norm_init(len(layer["b"]))} for layer in layers[:-1]]
+    return layers
 
 
 def cut(sampler: Callable[..., Array], key: Key, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
@@ -65,9 +80,10 @@ def uniform(key: Key, shape: tuple[int, ...]) -> Array:
 
 
 def mlp(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-    """Apply the layers in order, with a ReLU after each but the last."""
+    """Apply the layers in order, with a ReLU after each but the last, and before it the layer's norm, if it has one."""
     for layer in params[:-1]:
-        x = jax.nn.relu(linear(layer, x))
+        x = linear(layer, x)
+        x = jax.nn.relu(layer_norm(layer["norm"], x) if "norm" in layer else x)
     return linear(params[-1], x)
 
 
@@ -99,9 +115,9 @@ def sample(policy: Gaussian, key: Key) -> tuple[Float[Array, "*batch action"], F
     return jnp.tanh(raw), (normal - slope).sum(-1)
 
 
-def twin_init(key: Key, sizes: tuple[int, ...]) -> Params:
+def twin_init(key: Key, sizes: tuple[int, ...], norm: Norm = "none") -> Params:
     """Initialise two independent critics."""
-    return [mlp_init(k, sizes) for k in jax.random.split(key)]
+    return [mlp_init(k, sizes, norm=norm) for k in jax.random.split(key)]
 
 
 def twin(

@@ -8,14 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
-from delayrl.core.networks import Params, cut, linear, uniform
+from delayrl.core.networks import Params, cut, layer_norm, layer_norm_init, linear, uniform
 from delayrl.core.types import Key
-
-
-def layer_norm(params: Params, x: Float[Array, "*batch width"]) -> Float[Array, "*batch width"]:
-    """Normalise the last axis (ε = 1e-5), then scale and shift it."""
-    centred = x - x.mean(-1, keepdims=True)
-    return centred * jax.lax.rsqrt((centred**2).mean(-1, keepdims=True) + 1e-5) * params["scale"] + params["shift"]
 
 
 def dropout(kept: Bool[Array, "*shape"] | None, rate: float, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -62,15 +56,12 @@ def transformer_init(key: Key, obs_size: int, action_size: int, length: int, wid
     def biased(w: Array) -> Params:
         return {"w": w, "b": jnp.zeros(w.shape[1])}
 
-    def normed() -> Params:
-        return {"scale": jnp.ones(width), "shift": jnp.zeros(width)}
-
     blocks = [
         {
-            "norm1": normed(),
+            "norm1": layer_norm_init(width),
             "qkv": biased((6 / (4 * width)) ** 0.5 * qkv),
             "out": biased(out),
-            "norm2": normed(),
+            "norm2": layer_norm_init(width),
             "mlp": [biased(first), biased(second)],
         }
         for qkv, out, first, second in zip(xavier, rest[::3], rest[1::3], rest[2::3], strict=True)
@@ -80,9 +71,9 @@ def transformer_init(key: Key, obs_size: int, action_size: int, length: int, wid
         "action": biased(of_action),
         "join": biased(join),
         "position": position,
-        "norm_in": normed(),
+        "norm_in": layer_norm_init(width),
         "blocks": blocks,
-        "norm_out": normed(),
+        "norm_out": layer_norm_init(width),
     }
 
 

@@ -130,7 +130,10 @@ def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, 
             f"a run keeps its delay as text, and {str(parsed)[:60]!r} cannot be read back: use delayrl.delays"
         )
     condition = Condition(agent, env, text, preset, protocol, dict(overrides), schedule.steps)
-    return Setup(condition, override(base.agent, values), schedule, parsed, chosen)
+    made = override(base.agent, values)
+    if for_run := getattr(made, "for_run", None):
+        made = for_run(schedule)
+    return Setup(condition, made, schedule, parsed, chosen)
 
 
 def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:

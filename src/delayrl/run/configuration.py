@@ -11,6 +11,7 @@ from delayrl.errors import DelayRLError
 OLDER: Mapping[str, Any] = {
     "entropy_unit": "scaled",
     "at_age_0": "reference",
+    "critic_norm": "none",
     "student_optimiser": "rmsprop",
     "temperature": "fixed",
     "update_after": 0,

@@ -126,8 +126,6 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     if task is None or task.max_episode_steps is None:
         name = task.id if task else "the task"
         raise DelayRLError(f"{name} has no time limit, so evaluation may never end; register it with one")
-    if check := getattr(agent, "check", None):
-        check(schedule)
     return template(agent, spec)
 
 
