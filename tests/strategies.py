@@ -37,6 +37,6 @@ LAWS = st.one_of(
     st.builds(random_walk, STEPS, CHANCE),
     st.lists(STEPS, min_size=1, max_size=60).map(lambda steps: Recorded(tuple(steps))),
 )
-CHANNELS = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "raw"]))
-ORDERED = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo"]))
+CHANNELS = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "raw", "wait"]))
+ORDERED = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "wait"]))
 DELAYS = st.builds(Delay, CHANNELS, st.one_of(st.just(Channel()), CHANNELS), st.one_of(st.just(Channel()), ORDERED))

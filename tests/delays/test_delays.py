@@ -157,7 +157,7 @@ def test_channels_of_a_text() -> None:
         ("walk:3:2", "from 0 to 1"),
         ("poisson:-1:3", "positive"),
         ("gamma:100:1:3", "never below"),
-        ("5@soon", "newest, fifo, raw"),
+        ("5@soon", "newest, fifo, raw, wait"),
         ("80ms", "no `dt`"),
         ("1+2", "is not a number"),
         ("1+observation=2", "two for the observations"),

@@ -46,7 +46,10 @@ def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[
 
     def send(name: str, made: int) -> int:
         channel = getattr(delay, name)
-        travel, states[name] = channel.law.draw(states[name], random)
+        if channel.rule == "wait":
+            travel = channel.maximum
+        else:
+            travel, states[name] = channel.law.draw(states[name], random)
         arrives = made + travel
         if channel.rule == "fifo":
             arrives = max([arrives, *(a for _, a in sent[name])])

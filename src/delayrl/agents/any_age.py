@@ -13,7 +13,7 @@ What it takes from whom stands in docs/algorithms/any-age.md.
 
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,7 @@ class AnyAge:
         """Return None: the delay-free policy is the same network at age 0 (`delayrl evaluate --sweep`)."""
         return None
 
-    def for_run(self, schedule: Schedule) -> Self:
+    def for_run(self, schedule: Schedule) -> "AnyAge":
         """Return the agent with the length of its run. Raises DelayRLError if the weight falls before it is held."""
         if self.pull_hold > self.pull_end:
             raise DelayRLError(f"pull_hold must be no later than pull_end, {self.pull_end}; got {self.pull_hold}")

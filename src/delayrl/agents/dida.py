@@ -12,7 +12,7 @@ Deviations from the paper and from the released code are numbered in docs/algori
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ class DIDA:
         """Return the expert."""
         return self.reference, state.reference
 
-    def for_run(self, schedule: Schedule) -> Self:
+    def for_run(self, schedule: Schedule) -> "DIDA":
         """Return the agent. Raises DelayRLError unless the expert finishes between the random steps and the end."""
         if not schedule.random_steps < self.expert_steps < schedule.steps:
             raise DelayRLError(

@@ -14,7 +14,7 @@ Deviations from the paper and from the released code are numbered in docs/algori
 
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ class Lifting:
         """Return the delay-free SAC towards which the delayed policy is pulled."""
         return self.reference, state.reference
 
-    def for_run(self, schedule: Schedule) -> Self:
+    def for_run(self, schedule: Schedule) -> "Lifting":
         """Return the agent. Raises DelayRLError unless the weight reaches 0 by the end of the run."""
         if self.lifting_end > schedule.steps:
             raise DelayRLError(

@@ -11,7 +11,7 @@ gilbert:1:6:0.05:0.3    a network in a good (1 step) or bad state (6); worsens w
 markov:0,5:0.9,0.1/0.5,0.5  a chain of two states with delays 0 and 5, and its transitions row by row
 walk:8, walk:8:0.5      a random walk on 0..8 that moves with probability 2/3 (or 0.5)
 recorded:trace.csv      measured delays, from a random one on; recorded:trace.csv:ms if they are times
-uniform:1:5@fifo        a rule: newest (the default), fifo or raw
+uniform:1:5@fifo        a rule: newest (the default), fifo, raw or wait
 2+action=1+reward=3     observations 2 steps late, actions 1, rewards and terminations 3
 paper-stochastic-5      VDPO's stochastic delay: 5 with probability 0.9, else uniform on 1..5; rule raw
 ```
@@ -29,7 +29,7 @@ from delayrl.delays.laws import Constant, DelayLaw, whole_steps
 from delayrl.delays.recordings import in_steps, is_number, recorded, rounded_up
 from delayrl.errors import DelayRLError
 
-Rule = Literal["newest", "fifo", "raw"]
+Rule = Literal["newest", "fifo", "raw", "wait"]
 """Which message counts at step t. `newest`: of those that have arrived, the last one sent; older ones that arrive later
 are ignored. `fifo`: the same, but no message overtakes another. `raw`: s_{t-d} with d drawn anew at each step, so that
 the observation may go back in time."""
@@ -60,8 +60,8 @@ class Channel:
 
     @property
     def constant(self) -> bool:
-        """Whether every message travels equally long."""
-        return isinstance(self.law, Constant)
+        """Whether every message counts equally late: it travels as long as every other, or waits for the longest."""
+        return isinstance(self.law, Constant) or self.rule == "wait"
 
     def __str__(self) -> str:
         for name, preset in PRESETS.items():
@@ -120,7 +120,7 @@ class Delay:
         if not self.action.constant:
             raise DelayRLError(
                 f"training takes actions with a constant delay; got {self.action}. Hold early ones back until "
-                f"{self.action.maximum} steps have passed (action={self.action.maximum}), or train on delayrl.wrappers"
+                f"{self.action.maximum} steps have passed (action={self.action.law}@wait), or train on delayrl.wrappers"
             )
         if not self.action.maximum:
             return Delay(self.observation)

@@ -50,6 +50,7 @@ class RewardQueue:
 
     def __init__(self, channel: Channel):
         self._law, self._fifo, self._slots = channel.law, channel.rule == "fifo", channel.maximum + 1
+        self._waits = channel.rule == "wait"
         self.start()
 
     def start(self) -> None:
@@ -59,7 +60,9 @@ class RewardQueue:
 
     def send(self, reward: float, now: int, random: np.random.Generator) -> int:
         """Send the reward of the step that ended at `now`. Returns when it arrives."""
-        travel, self._law_state = self._law.draw(self._law_state, random)
+        travel = self._slots - 1
+        if not self._waits:
+            travel, self._law_state = self._law.draw(self._law_state, random)
         arrival = now + travel
         if self._fifo:
             self._latest = arrival = max(arrival, self._latest)
