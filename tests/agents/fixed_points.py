@@ -159,7 +159,7 @@ def actor_critic_fixed_point(
     ends_in = np.eye(unmet.shape[1])[windows.shorter].T  # (Z, Y)
     q, _ = soft_optimal(augment(mdp, shorter).mdp, temperature)
     policy = softmax(unmet @ q / temperature)
-    for attempt in range(300):
+    for attempt in range(1000):
         late, free = policy[windows.augmented], softmax(q / temperature)[windows.shorter]
         acting = behaviour(data, q[windows.shorter], free, late)
         met = ends_in * occupancy(windows.mdp, acting)

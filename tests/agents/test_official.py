@@ -153,6 +153,7 @@ def test_openings(agent: str, kind: str, length: int, tmp_path: Path, monkeypatc
 
 def test_contest_of_vdpo(rng: np.random.Generator) -> None:
     """At age 0 a random action stands against the reference's, and the one with the lower Q is taken."""
+    assert official("vdpo").agent.at_age_0 == "random"
     agent = replace(TINY["vdpo"], at_age_0="random")
     state = agent.init(Spec(OBS, ACT, DELAY), jax.random.key(0))
     taken, lower = [], []

@@ -43,7 +43,7 @@ def test_round_trip(channel: Channel, lag: int, seed: int) -> None:
     windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(
         replay, jax.random.key(seed), 256, longest, 2, jnp.int32(0)
     )
-    now, later = (jax.jit(jax.vmap(lambda w, k=k: view(w, k)))(windows) for k in (0, 1))
+    now, later = (jax.device_get(jax.jit(jax.vmap(lambda w, k=k: view(w, k)))(windows)) for k in (0, 1))
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     for i, action in enumerate(np.asarray(windows.action[:, longest, 0]).tolist()):
         step = by_action[action]

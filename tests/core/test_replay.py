@@ -94,7 +94,7 @@ def test_round_trip() -> None:
         windows = draw(replay, 3000, delay, 3)
         by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
         for shorter in {None, 0, delay // 2}:
-            views = jax.jit(jax.vmap(lambda w, shorter=shorter: view(w, 0, shorter)))(windows)
+            views = jax.device_get(jax.jit(jax.vmap(lambda w, shorter=shorter: view(w, 0, shorter)))(windows))
             for i, action in enumerate(np.asarray(windows.action[:, delay, 0]).tolist()):
                 step = by_action[action]
                 known = shown[step]
@@ -114,7 +114,7 @@ def test_view_ahead_is_the_next_view() -> None:
     delay = 4
     replay, transitions, shown = filled(150, delay, 400)
     windows = draw(replay, 500, delay, 3)
-    views = jax.vmap(lambda w: view(w, w.n_step))(windows)
+    views = jax.device_get(jax.jit(jax.vmap(lambda w: view(w, w.n_step)))(windows))
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     checked = 0
     for i, action in enumerate(np.asarray(windows.action[:, delay, 0]).tolist()):
