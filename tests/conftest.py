@@ -38,6 +38,7 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 from delayrl.agents.adsac import ADSAC  # noqa: E402
+from delayrl.agents.any_age import AnyAge  # noqa: E402
 from delayrl.agents.dcac import DCAC  # noqa: E402
 from delayrl.agents.dida import DIDA  # noqa: E402
 from delayrl.agents.lifting import Lifting  # noqa: E402
@@ -55,6 +56,7 @@ TINY = {
     "sac-memoryless": SAC(actor_sees="delayed", critic_sees="delayed", hidden=(16, 16), batch_size=16),
     "a-sac": SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16),
     "bpql": SAC(actor_sees="augmented", critic_sees="current", hidden=(16, 16), batch_size=16),
+    "any-age": AnyAge(replace(BPQL, hidden=(16, 16), batch_size=16, update_every=1, updates=1, critic_norm="layer")),
     "lifting": Lifting(replace(BPQL, hidden=(16, 16), batch_size=16, update_every=10, updates=10)),
     "ad-sac": ADSAC(SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16)),
     "dcac": DCAC(hidden=(16, 16), batch_size=16),

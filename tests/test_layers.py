@@ -94,7 +94,7 @@ def test_agents_know_no_environment_replay_or_loop() -> None:
 
 
 def test_loop_names_no_algorithm() -> None:
-    agents = ("vdpo", "bpql", "dcac", "dida", "adsac", "lifting")
+    agents = ("vdpo", "bpql", "dcac", "dida", "adsac", "lifting", "anyage", "any_age")
     for file in [*(SOURCE / "training").glob("*.py"), SOURCE / "core/replay.py", SOURCE / "play/evaluation.py"]:
         code = [line for line in file.read_text().lower().splitlines() if "preset" not in line]
         assert not [agent for agent in agents if agent in "\n".join(code)], file

@@ -12,7 +12,7 @@ from delayrl.core.types import Seen, Spec, Window
 from delayrl.training.learner import Program
 
 ENV, OBS, ACT = "Reacher-v5", 10, 2
-DELAYED = ["sac-memoryless", "a-sac", "bpql", "lifting", "ad-sac", "dcac", "dida", "vdpo"]
+DELAYED = ["sac-memoryless", "a-sac", "bpql", "any-age", "lifting", "ad-sac", "dcac", "dida", "vdpo"]
 
 
 @functools.cache

@@ -50,11 +50,12 @@ def test_presets_have_their_views() -> None:
         "a-sac": ("augmented", "augmented"),
         "bpql": ("augmented", "current"),
         "ad-sac": ("augmented", "augmented"),
+        "any-age": ("augmented", "current"),
         "lifting": ("augmented", "current"),
         "vdpo": ("current", "current"),
         "dida": ("current", "current"),
     }
-    inner = {"ad-sac": "learner", "lifting": "bpql", "vdpo": "reference", "dida": "reference"}
+    inner = {"ad-sac": "learner", "lifting": "bpql", "any-age": "bpql", "vdpo": "reference", "dida": "reference"}
     for name, pair in views.items():
         for preset in AGENTS[name].presets.values():
             agent = getattr(preset.agent, inner[name]) if name in inner else preset.agent

@@ -39,9 +39,7 @@ class AnyAge:
     """The any-age agent."""
 
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, critic_norm="layer"))
-    second_age: Annotated[SecondAge, "the younger age that the actor learns at too: random in 0..d, or 0"] = (
-        "random"
-    )
+    second_age: Annotated[SecondAge, "the younger age that the actor learns at too: random in 0..d, or 0"] = "random"
     pull_weight: Annotated[float, "initial weight of the pull towards the younger age", (0.0, 1e6)] = 1.0
     pull_hold: Annotated[float, "part of the run in which the weight stays constant", (0.0, 1.0)] = 0.25
     pull_end: Annotated[float, "part of the run after which the weight, falling linearly, is 0", (0.0, 1.0)] = 0.75

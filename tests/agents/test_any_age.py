@@ -1,0 +1,109 @@
+"""Any-age: younger views of the same moment, the annealed pull, and BPQL or SAC where there is nothing to add."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from learning import ACT, OBS, counted, record, same, trained
+
+from conftest import TINY
+from delayrl.agents.any_age import AnyAge
+from delayrl.agents.base import Schedule
+from delayrl.agents.lifting import lifting_loss
+from delayrl.core import networks
+from delayrl.core import replay as ring
+from delayrl.core.objectives import soft_value
+from delayrl.core.types import Spec
+from delayrl.errors import DelayRLError
+
+AGENT = TINY["any-age"]
+
+
+def test_without_a_second_age_it_is_bpql() -> None:
+    """Bit for bit, with BPQL's critics normed alike; with one, the critics' first update is still BPQL's."""
+    plain = replace(AGENT, second_age="none")
+    assert same(trained(plain, 3)[0].agent, trained(AGENT.bpql, 3)[0].agent)
+    assert not same(trained(AGENT, 3)[0].agent.actor, trained(AGENT.bpql, 3)[0].agent.actor)
+
+
+def test_without_a_delay_it_is_sac() -> None:
+    assert same(trained(AGENT, 0)[0].agent, trained(replace(AGENT.bpql, actor_sees="current"), 0)[0].agent)
+
+
+def test_younger_views() -> None:
+    """On the counter: (s_{t-j}, the j actions since, j / Δ), each j from 0 to the shown age equally often."""
+    transitions, windows = counted(4, 300, batch=4000, ahead=1)
+    by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
+    x = np.asarray(AGENT.younger(windows, jax.random.key(1)))
+    fresh = np.asarray(replace(AGENT, second_age="zero").younger(windows, jax.random.key(1)))
+    ages: dict[int, list[int]] = {}
+    for i, action in enumerate(np.asarray(windows.action[:, 4, 0]).tolist()):
+        step = by_action[action]
+        now, length = transitions[step].obs
+        j = round(float(x[i, -1]) * 4)
+        since = [transitions[step - j + k].action[0] if k < j else 0 for k in range(4)]
+        np.testing.assert_allclose(x[i], [now - j, length, *since, j / 4], rtol=1e-6)
+        np.testing.assert_allclose(fresh[i], [now, length, 0, 0, 0, 0, 0])
+        ages.setdefault(int(windows.age[i, 4]), []).append(j)
+    for age, drawn in ages.items():
+        counts = np.bincount(drawn, minlength=age + 1)
+        assert len(counts) == age + 1  # none older than what was shown
+        expected = len(drawn) / (age + 1)
+        assert ((counts - expected) ** 2 / expected).sum() < age + 6 * np.sqrt(2 * max(age, 1))
+
+
+def test_actor_gradient_by_hand() -> None:
+    """Half for each age, and the pull of the older policy towards the younger, which is held fixed."""
+    transitions, _ = record("Reacher-v5", 3, 80)
+    replay = ring.init(Spec(OBS, ACT, 3), 200)
+    for transition in transitions:
+        replay = jax.jit(ring.append)(replay, transition)
+    windows = ring.sample(replay, jax.random.key(0), 16, 3, 1, jnp.int32(0))
+    state = AGENT.init(Spec(OBS, ACT, 3), jax.random.key(0))
+    older, critic_input = AGENT.bpql._inputs(windows, 0)
+    younger = AGENT.younger(windows, jax.random.key(2))
+    assert not np.allclose(older, younger)
+    moved = AGENT.improve_actor(younger, jnp.float32(3.0), state, older, critic_input, jax.random.key(5))
+    frozen = AGENT.bpql.policy(state.actor, younger)
+
+    def value(actor, x, key):
+        action, log_prob = networks.sample(AGENT.bpql.policy(actor, x), key)
+        return soft_value(
+            networks.twin(state.critic, critic_input, action), log_prob, jnp.exp(state.log_temperature)
+        ).mean()
+
+    def pull(actor):
+        return lifting_loss(AGENT.bpql.policy(actor, older), frozen)
+
+    keys = jax.random.split(jax.random.key(5))
+    parts = [jax.grad(value)(state.actor, x, key) for x, key in zip((older, younger), keys, strict=True)]
+    expected = jax.tree.map(lambda a, b, c: -0.5 * a - 0.5 * b + 3.0 * c, *parts, jax.grad(pull)(state.actor))
+    gradient = jax.tree.map(lambda mean: mean / 0.1, moved.actor_opt_state[0].mu)  # Adam's, from zero
+    for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
+
+
+def test_annealing_in_parts_of_the_run() -> None:
+    agent = replace(AGENT, pull_weight=2.0, pull_hold=0.25, pull_end=0.75).for_run(Schedule(steps=1000))
+    steps = [0, 250, 375, 500, 750, 1000]
+    np.testing.assert_allclose([agent.weight(jnp.int32(n)) for n in steps], [2, 2, 1.5, 1, 0, 0], rtol=1e-6)
+    sudden = replace(agent, pull_hold=0.5, pull_end=0.5)
+    assert [float(sudden.weight(jnp.int32(n))) for n in (499, 500)] == [2.0, 0.0]
+    with pytest.raises(DelayRLError, match=r"pull_hold must be no later than pull_end, 0\.2; got 0\.3"):
+        AnyAge(pull_hold=0.3, pull_end=0.2).for_run(Schedule())
+
+
+def test_normed_critics() -> None:
+    """The norm is before each hidden ReLU; the critic's answer does not change with the scale of that layer's input."""
+    critic = networks.twin_init(jax.random.key(0), (3, 8, 8, 1), "layer")
+    assert ["norm" in layer for layer in critic[0]] == [True, True, False]
+    x, action = jnp.array([[0.3, -1.0]]), jnp.array([[0.5]])
+    hidden = jnp.concatenate([x, action], -1)
+    for layer in critic[0][:-1]:
+        hidden = hidden @ layer["w"] + layer["b"]
+        hidden = (hidden - hidden.mean()) / jnp.sqrt(hidden.var() + 1e-5)
+        hidden = jnp.maximum(hidden, 0)
+    expected = (hidden @ critic[0][-1]["w"] + critic[0][-1]["b"])[0, 0]
+    np.testing.assert_allclose(networks.twin(critic, x, action)[0, 0], expected, rtol=1e-5)
