@@ -122,7 +122,7 @@ def test_unprivileged_behaviour_needs_no_truth(name: str, rng: np.random.Generat
     agent.act(state, seen(3, 2, rng), jax.random.key(0), explore=True)
 
 
-@pytest.mark.parametrize("name", list(HONEST))
+@pytest.mark.parametrize("name", quick(HONEST, *DELAYED, "vdpo, behaviour delayed", "ad-sac, behaviour augmented"))
 def test_learning_never_peeks(name: str) -> None:
     """What has not arrived may be anything: an unprivileged learner ends with the same parameters."""
     transitions, _ = record(ENV, 3, 40)

@@ -144,6 +144,7 @@ def test_it_asks_for_what_it_needs() -> None:
             AGENT.for_run(schedule)
 
 
+@pytest.mark.thorough
 def test_under_the_loop() -> None:
     """The phases in order; the first imitation comes before the student acts; the same twice; seeds side by side."""
     data = [record("Reacher-v5", 3, 31, seed)[0] for seed in range(2)]

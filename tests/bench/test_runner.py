@@ -26,23 +26,18 @@ from delayrl.run.condition import Condition
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> tuple[Path, Path]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The tiny grid and its finished runs."""
     home = tmp_path_factory.mktemp("undisturbed")
     file = tiny(home)
-    finish(bench("run", file, "--runs", home / "runs", cache=cache))
+    finish(bench("run", file, "--runs", home / "runs"))
     return file, home / "runs"
 
 
-def chaos(file: Path, runs: Path, cache: Path, kills: int, workers: int, within: float) -> int:
+def chaos(file: Path, runs: Path, kills: int, workers: int, within: float) -> int:
     """Run a grid and kill random workers, some seconds apart. Returns how many were killed."""
     cells, rng, killed = load_grid(file).cells, random.Random(kills), 0
-    process = bench("run", file, "--runs", runs, "--workers", workers, "--tries", kills + 1, cache=cache)
+    process = bench("run", file, "--runs", runs, "--workers", workers, "--tries", kills + 1)
     try:
         next_kill = time.monotonic() + rng.uniform(0, within)
         while process.poll() is None:
@@ -66,38 +61,38 @@ def ends(runs: Path, file: Path) -> list[int]:
     return [sum(e["event"] == "done" for e in folders.journal(runs / cell.folder)) for cell in cells]
 
 
-def test_workers_killed(undisturbed, tmp_path: Path, cache: Path) -> None:
+def test_workers_killed(undisturbed, tmp_path: Path) -> None:
     """Every cell ends once, with the rows and parameters of the undisturbed grid."""
     file, expected = undisturbed
-    assert chaos(file, tmp_path / "runs", cache, kills=2, workers=2, within=1) == 2
+    assert chaos(file, tmp_path / "runs", kills=2, workers=2, within=1) == 2
     assert_same_results(file, tmp_path / "runs", expected)
     assert ends(tmp_path / "runs", file) == [1, 1]
 
 
 @pytest.mark.slow
-def test_workers_killed_twenty_times(tmp_path: Path, cache: Path) -> None:
+def test_workers_killed_twenty_times(tmp_path: Path) -> None:
     file = tiny(tmp_path, steps=3000)
-    finish(bench("run", file, "--runs", tmp_path / "expected", cache=cache))
-    assert chaos(file, tmp_path / "runs", cache, kills=20, workers=2, within=8) == 20
+    finish(bench("run", file, "--runs", tmp_path / "expected"))
+    assert chaos(file, tmp_path / "runs", kills=20, workers=2, within=8) == 20
     assert_same_results(file, tmp_path / "runs", tmp_path / "expected")
     assert ends(tmp_path / "runs", file) == [1, 1]
 
 
-def test_finished_cells_are_skipped(undisturbed, cache: Path) -> None:
+def test_finished_cells_are_skipped(undisturbed) -> None:
     file, runs = undisturbed
     before = {path: path.stat().st_mtime_ns for path in runs.rglob("*.jsonl")}
-    assert "2 of 2 cells done" in finish(bench("run", file, "--runs", runs, cache=cache))
+    assert "2 of 2 cells done" in finish(bench("run", file, "--runs", runs))
     assert before == {path: path.stat().st_mtime_ns for path in runs.rglob("*.jsonl")}
 
 
 @pytest.mark.thorough
-def test_time_limit(tmp_path: Path, cache: Path) -> None:
+def test_time_limit(tmp_path: Path) -> None:
     """The grid stops at a checkpoint with status 75 and releases its cells; the same command resumes it."""
     file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
     cells, reached = load_grid(file).cells, 0
     for advances in range(2):
         for _ in range(6):  # on a slow machine compiling takes all the time
-            said = finish(bench("run", file, "--runs", runs, "--time-limit", "10s", cache=cache), 75)
+            said = finish(bench("run", file, "--runs", runs, "--time-limit", "10s"), 75)
             assert "0 of 2 cells done" in said
             assert "the same command resumes it" in said
             now = [p for _, p in standing(cells, runs)]
@@ -111,13 +106,13 @@ def test_time_limit(tmp_path: Path, cache: Path) -> None:
     assert "stopped" in [e["event"] for e in folders.journal(runs / cells[0].folder)]
 
 
-def test_stopped_or_killed_runner(undisturbed, tmp_path: Path, cache: Path) -> None:
+def test_stopped_or_killed_runner(tmp_path: Path) -> None:
     """Its workers store a checkpoint in both cases."""
     file, runs = tiny(tmp_path, steps=60_000), tmp_path / "runs"
     cell = load_grid(file).cells[0]
     for kind, status in ((signal.SIGTERM, 75), (signal.SIGKILL, -signal.SIGKILL)):
         step = folders.stored(runs / cell.folder, cell.seeds)[0]
-        process = bench("run", file, "--runs", runs, "--cells", cell.id, cache=cache)
+        process = bench("run", file, "--runs", runs, "--cells", cell.id)
         until(lambda step=step: folders.stored(runs / cell.folder, cell.seeds)[0] > step)
         process.send_signal(kind)
         process.communicate(timeout=60)
@@ -134,10 +129,10 @@ def until(condition, timeout: float = 120) -> None:
 
 
 @pytest.mark.thorough
-def test_two_runners(undisturbed, tmp_path: Path, cache: Path) -> None:
+def test_two_runners(undisturbed, tmp_path: Path) -> None:
     """Two runners share a grid: each cell begins and ends once, and both runners succeed."""
     file, runs = tiny(tmp_path), tmp_path / "runs"
-    both = [bench("run", file, "--runs", runs, cache=cache) for _ in range(2)]
+    both = [bench("run", file, "--runs", runs) for _ in range(2)]
     assert all("2 of 2 cells done" in finish(process) for process in both)
     for cell in load_grid(file).cells:
         assert [e["event"] for e in folders.journal(runs / cell.folder)] == ["begun", "done"]
@@ -154,7 +149,7 @@ exit $status
 
 
 @pytest.mark.thorough
-def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
+def test_full_disk(undisturbed, tmp_path: Path) -> None:
     """A full disk fails with one line and is not tried again; with room the grid resumes without loss."""
     file, expected = undisturbed
     if subprocess.run(["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode:
@@ -174,7 +169,7 @@ def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
     ]
     done = subprocess.run(
         ["unshare", "-rm", "bash", "-c", SMALL_DISK, "-", str(disk), "240k", *command],
-        env=os.environ | {"RUNS": str(disk / "runs"), "KEPT": str(kept), "JAX_COMPILATION_CACHE_DIR": str(cache)},
+        env=os.environ | {"RUNS": str(disk / "runs"), "KEPT": str(kept)},
         capture_output=True,
         text=True,
     )
@@ -185,7 +180,7 @@ def test_full_disk(undisturbed, tmp_path: Path, cache: Path) -> None:
     assert "No space left on device" in last or "the disk is full" in last
     step = [folders.stored(kept / cell.folder, cell.seeds)[0] for cell in load_grid(file).cells]
     assert any(0 < n < 240 for n in step)
-    finish(bench("run", file, "--runs", kept, cache=cache))
+    finish(bench("run", file, "--runs", kept))
     assert_same_results(file, kept, expected)
 
 

@@ -105,12 +105,14 @@ def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
         train("bpql", tmp_path / "run", updates_per_call=7)
 
 
+@pytest.mark.thorough
 def test_a_block_may_begin_before_learning_does(tmp_path: Path) -> None:
     """Its own random steps are there to learn from."""
     run = train("bpql", tmp_path / "run", random_steps=50, updates_per_call=100)
     assert run.latest().complete
 
 
+@pytest.mark.thorough
 def test_episodes_that_are_too_short_to_learn_from(tmp_path: Path) -> None:
     """Where the last n_steps - 1 steps of an episode are never drawn, and it has no more."""
     values = {"protocol": "official", "n_steps": 60, "random_steps": 140, "representation": "mlp"}
