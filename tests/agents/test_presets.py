@@ -5,8 +5,10 @@ import pytest
 from delayrl.agents.registry import AGENTS
 from delayrl.run.configuration import values_of
 
+ANY_AGE = {"second_age": "random", "pull_weight": 1.0, "pull_hold": 0.25, "pull_end": 0.75}
 VDPO_SAC = {  # VDPO: appendix, table of hyperparameters; log-std, n-step, actor_updates, start: its released code
     "hidden": [256, 256],
+    "critic_norm": "none",
     "actor_learning_rate": 3e-4,
     "critic_learning_rate": 1e-3,
     "temperature_learning_rate": 1e-3,
@@ -23,6 +25,16 @@ VDPO_SAC = {  # VDPO: appendix, table of hyperparameters; log-std, n-step, actor
     "batch_size": 256,
     "update_every": 1,
     "updates": 1,
+}
+MATCHED = VDPO_SAC | {
+    "critic_learning_rate": 3e-4,
+    "temperature_learning_rate": 3e-4,
+    "entropy_unit": "scaled",
+    "n_steps": 1,
+    "actor_every": 1,
+    "actor_updates": 1,
+    "log_std_range": [-20.0, 2.0],
+    "log_std_bounds": "clip",
 }
 BPQL = VDPO_SAC | {  # BPQL: released code, main.py
     "critic_learning_rate": 3e-4,
@@ -83,6 +95,7 @@ PAPER = {
         "log_std_range": [-20.0, 2.0],
         "batch_size": 128,
     },
+    "any-age": MATCHED | ANY_AGE | {"critic_norm": "layer"},  # ours
     "bpql": BPQL,
     "lifting": BPQL  # DHRL: agents/d2hpg_bpql.py
     | {"initial_temperature": 0.2, "lifting_weight": 10.0, "lifting_hold": 250_000, "lifting_end": 750_000},
@@ -105,23 +118,11 @@ def test_paper(agent: str) -> None:
     assert values_of(preset.schedule) == SCHEDULE | OWN_SCHEDULE.get(agent, {})
 
 
-MATCHED = VDPO_SAC | {
-    "critic_learning_rate": 3e-4,
-    "temperature_learning_rate": 3e-4,
-    "entropy_unit": "scaled",
-    "n_steps": 1,
-    "actor_every": 1,
-    "actor_updates": 1,
-    "log_std_range": [-20.0, 2.0],
-    "log_std_bounds": "clip",
-}
-
-
 @pytest.mark.parametrize("agent", [agent for agent in AGENTS if agent not in ("random", "dcac")])
 def test_matched(agent: str) -> None:
     """Every option that agents share has one value. AD-SAC has two actors, of which an update improves one."""
     values = values_of(AGENTS[agent].presets["matched"].agent)
-    shared = MATCHED | ({"actor_updates": 2} if agent == "ad-sac" else {})
+    shared = MATCHED | {"ad-sac": {"actor_updates": 2}, "any-age": {"critic_norm": "layer"}}.get(agent, {})
     assert {name: values[name] for name in shared} == shared
     own = {"learning_rate": 3e-4, "student_learning_rate": 3e-4, "student_hidden": [256, 256]}
     own |= {"student_batch_size": 256, "student_optimiser": "adam"}

@@ -105,16 +105,16 @@ _SMALL_DIDA = DIDA(_SMALL_SAC, expert_steps=10_000, round_steps=250, imitation_u
 _LAYER_NORMED = replace(_MATCHED_BPQL, critic_norm="layer")
 
 AGENTS: dict[str, Registration] = {
-    "any-age": Registration(
-        "BPQL whose actor learns at two ages of one moment, the older pulled towards the younger",
-        "-",
-        _presets(AnyAge(_LAYER_NORMED), AnyAge(_LAYER_NORMED), AnyAge(replace(_SMALL_BPQL, critic_norm="layer"))),
-    ),
     "vdpo": Registration(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
         "Wu et al., NeurIPS 2024",
         _presets(VDPO(), _MATCHED_VDPO, _SMALL_VDPO),
         replace(_VDPO, opening="agent", overrides={**OFFICIAL.overrides, "at_age_0": "random"}),
+    ),
+    "any-age": Registration(
+        "BPQL whose actor learns at two ages of one moment, the older pulled towards the younger",
+        "-",
+        _presets(AnyAge(_LAYER_NORMED), AnyAge(_LAYER_NORMED), AnyAge(replace(_SMALL_BPQL, critic_norm="layer"))),
     ),
     "lifting": Registration(
         "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
