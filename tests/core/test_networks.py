@@ -134,12 +134,12 @@ def test_mlp_by_hand() -> None:
 
 
 def test_critics_by_hand() -> None:
-    """Q_1 = s + 10 a and Q_2 = 2 s - a at (s, a) = (1, ±1): 11 and 1, -9 and 3; the lower minimum is that of a = -1."""
-    critic = [[{"w": jnp.array([[s], [a]]), "b": jnp.zeros(1)}] for s, a in ((1.0, 10.0), (2.0, -1.0))]
+    """(30, -18) at (s, a) = (1, 1) and (-9, 22) at (1, -1): the first has the lower minimum, the other the lower Q_1."""
+    critic = [[{"w": jnp.array([[s], [a]]), "b": jnp.zeros(1)}] for s, a in ((10.5, 19.5), (2.0, -20.0))]
     s, one, other = jnp.ones(1), jnp.ones(1), -jnp.ones(1)
-    np.testing.assert_allclose(networks.twin(critic, s, one), [11.0, 1.0])
-    np.testing.assert_allclose(networks.twin(critic, s, other), [-9.0, 3.0])
-    assert networks.lower_q(critic, s, one, other) == networks.lower_q(critic, s, other, one) == -1.0
+    np.testing.assert_allclose(networks.twin(critic, s, one), [30.0, -18.0])
+    np.testing.assert_allclose(networks.twin(critic, s, other), [-9.0, 22.0])
+    assert networks.lower_q(critic, s, one, other) == networks.lower_q(critic, s, other, one) == 1.0
     twins = networks.twin_init(jax.random.key(0), (3, 1))
     assert not np.array_equal(twins[0][0]["w"], twins[1][0]["w"])
 
