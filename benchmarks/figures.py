@@ -10,8 +10,8 @@ import matplotlib
 import numpy as np
 
 matplotlib.use("Agg")
-from matplotlib import pyplot
 from learning import curves as learning
+from matplotlib import pyplot
 from speed import tables as speed
 
 from delayrl.cli.main import main as delayrl
@@ -263,7 +263,8 @@ def main() -> None:
     if (HERE / "results" / "first.sqlite").exists():
         insert(root / "README.md", "first", first(root))
     if list((HERE / "results" / "learning").glob("*.jsonl")):
-        insert(root / "docs" / "benchmarks.md", "learning", learning.section(HERE / "results" / "learning", images / "learning.png"))
+        text = learning.section(HERE / "results" / "learning", images / "learning.png")
+        insert(root / "docs" / "benchmarks.md", "learning", text)
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)
 
