@@ -33,6 +33,8 @@ install_import_hook(
     "beartype.beartype",
 )
 
+gc.set_threshold(50_000)  # tracing allocates so much that a tenth of the time went into collecting garbage
+
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
@@ -79,12 +81,6 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the folders that take longest, so that both processes end at about the same time."""
     items.sort(key=lambda item: item.path.parent.name not in ("agents", "training"))
-
-
-def pytest_collection_finish() -> None:
-    """Spare garbage collections the objects of all imported modules: tracing allocates much, so they are frequent."""
-    gc.collect()
-    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
