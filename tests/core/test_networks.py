@@ -134,7 +134,7 @@ def test_mlp_by_hand() -> None:
 
 
 def test_critics_by_hand() -> None:
-    """(30, -18) at (s, a) = (1, 1) and (-9, 22) at (1, -1): the first has the lower minimum, the other the lower Q_1."""
+    """(30, -18) at (s, a) = (1, 1) and (-9, 22) at (1, -1): the first has the lower minimum."""
     critic = [[{"w": jnp.array([[s], [a]]), "b": jnp.zeros(1)}] for s, a in ((10.5, 19.5), (2.0, -20.0))]
     s, one, other = jnp.ones(1), jnp.ones(1), -jnp.ones(1)
     np.testing.assert_allclose(networks.twin(critic, s, one), [30.0, -18.0])

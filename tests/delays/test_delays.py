@@ -117,7 +117,14 @@ def test_recorded_files(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "step", "maximum"),
-    [("80ms", 0.04, 2), ("0.08s", 0.05, 2), ("81ms", 0.04, 3), ("0.1s", 0.1, 1), ("uniform:20ms:90ms", 0.02, 5)],
+    [
+        ("80ms", 0.04, 2),
+        ("0.08s", 0.05, 2),
+        ("81ms", 0.04, 3),
+        ("0.1s", 0.1, 1),
+        ("70ms", 0.01, 7),
+        ("uniform:20ms:90ms", 0.02, 5),
+    ],
 )
 def test_times_are_rounded_up(text: str, step: float, maximum: int) -> None:
     assert as_delay(text, step).maximum == maximum
