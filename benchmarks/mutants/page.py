@@ -7,8 +7,11 @@ from typing import Any
 from catalogue import Mutant
 
 
-def text(mutants: list[Mutant], rows: dict[str, dict[str, Any]]) -> str:
-    """Return the page: a summary, the survivors with the reason of each, and all mutants by file."""
+def text(mutants: list[Mutant], rows: dict[str, dict[str, Any]], older: set[str]) -> str:
+    """Return the page: a summary, the survivors with the reason of each, and all mutants by file.
+
+    `older` names the results whose files have changed since.
+    """
     found = [mutant for mutant in mutants if mutant.name in rows]
     outcome = {mutant.name: rows[mutant.name]["outcome"] for mutant in found}
     survivors = [mutant for mutant in found if outcome[mutant.name] not in ("killed", "timeout")]
@@ -25,7 +28,9 @@ def text(mutants: list[Mutant], rows: dict[str, dict[str, Any]]) -> str:
         f"Their tests took {seconds / 60:.0f} minutes, one after the other.\n",
     ]
     if len(found) < len(mutants):
-        parts.append(f"{len(mutants) - len(found)} more mutants have no result for the code as it is.\n")
+        parts.append(f"{len(mutants) - len(found)} more mutants have no result yet.\n")
+    if older:
+        parts.append(f"The mutated file or a test file of {len(older)} mutants has changed since their result.\n")
     rest = [f"| `{m.name}` | {m.breaks} | {m.survives or 'a test is missing'} |" for m in survivors]
     table = ["| mutant | what it breaks | why it survives |", "| --- | --- | --- |", *rest]
     parts.append("## Survivors\n\n" + ("\n".join(table) if rest else "None.") + "\n")

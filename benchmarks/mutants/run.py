@@ -133,13 +133,14 @@ def git(*words: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", metavar="TEXT", help="mutants whose names contain this text")
+    parser.add_argument("--only", nargs="+", default=[""], metavar="TEXT", help="mutants whose names contain a text")
     parser.add_argument("--workers", type=int, default=2, help="how many to test at a time (2)")
     parser.add_argument("--fresh", action="store_true", help="compute all results again")
     arguments = parser.parse_args()
     everything = read()
     stale = {mutant.name: why for mutant in everything if (why := mutant.stale(ROOT))}
-    mutants = [mutant for mutant in everything if arguments.only in mutant.name and mutant.name not in stale]
+    mutants = [mutant for mutant in everything if any(text in mutant.name for text in arguments.only)]
+    mutants = [mutant for mutant in mutants if mutant.name not in stale]
     lines = RESULTS.read_text(encoding="utf-8").splitlines() if RESULTS.exists() else []
     known = {row["name"]: row for row in map(json.loads, lines)}
     due = [mutant for mutant in mutants if arguments.fresh or not current(mutant, known)]
@@ -154,9 +155,9 @@ def main() -> None:
             run([mutant for mutant in due if mutant.name not in stale], arguments.workers, root, known)
     rows = {mutant.name: known[mutant.name] for mutant in everything if mutant.name in known}
     RESULTS.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")
-    found = {mutant.name: rows[mutant.name] for mutant in everything if current(mutant, rows)}
-    (ROOT / "docs" / "mutants.md").write_text(page.text(everything, found), encoding="utf-8")
-    alive = [mutant for mutant in mutants if mutant.name in found and found[mutant.name]["outcome"] == "survived"]
+    older = {mutant.name for mutant in everything if mutant.name in rows and not current(mutant, rows)}
+    (ROOT / "docs" / "mutants.md").write_text(page.text(everything, rows, older), encoding="utf-8")
+    alive = [mutant for mutant in mutants if rows.get(mutant.name, {}).get("outcome") == "survived"]
     failed = [mutant.name for mutant in alive if not mutant.survives]
     for line in [*stale.values(), *(f"{name}: no test notices it" for name in failed)]:
         print(line, file=sys.stderr)

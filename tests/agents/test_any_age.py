@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, OBS, counted, record, same, trained
+from learning import ACT, OBS, counted, random_windows, record, same, trained
 
 from conftest import TINY
 from delayrl.agents.any_age import AnyAge
@@ -93,6 +93,17 @@ def test_annealing_in_parts_of_the_run() -> None:
     assert [float(sudden.weight(jnp.int32(n))) for n in (499, 500)] == [2.0, 0.0]
     with pytest.raises(DelayRLError, match=r"pull_hold must be no later than pull_end, 0\.2; got 0\.3"):
         AnyAge(pull_hold=0.3, pull_end=0.2).for_run(Schedule())
+
+
+def test_clock_is_the_environment_step() -> None:
+    """`count` numbers updates: with two every four steps, updates 2i and 2i + 1 happen at step 4i."""
+    bpql = replace(AGENT.bpql, update_every=4, updates=2)
+    agent = replace(AGENT, bpql=bpql, pull_weight=2.0, pull_hold=0.25, pull_end=0.75).for_run(Schedule(steps=16))
+    spec = Spec(OBS, ACT, 3)
+    state, update = agent.init(spec, jax.random.key(0)), jax.jit(agent.update)
+    for count, weight in ((2, 2.0), (3, 2.0), (4, 1.0), (5, 1.0), (6, 0.0)):
+        _, metrics = update(state, random_windows(spec), jax.random.key(1), jnp.int32(count))
+        np.testing.assert_allclose(metrics["pull_weight"], weight)
 
 
 def test_normed_critics() -> None:
