@@ -86,6 +86,7 @@ def test_what_may_be_missing_is_hidden(delay: str, longest: int) -> None:
             actor.step(np.zeros(2, np.float32))
 
 
+@pytest.mark.thorough
 def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Travel times come back with the episode: the same rows and parameters as uninterrupted."""
     delay = "uniform:0:2@fifo+action=1+reward=2"

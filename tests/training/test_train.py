@@ -260,6 +260,7 @@ def test_unknown_agent() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::delayrl.errors.DelayWarning")
+@pytest.mark.thorough
 def test_a_delay_as_long_as_the_episode(tmp_path: Path) -> None:
     """The agent is blind after the start, and what it did is still learned from."""
     run = train("a-sac", tmp_path / "run", delay=50, random_steps=110)
