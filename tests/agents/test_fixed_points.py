@@ -38,6 +38,8 @@ from delayrl.agents.vdpo import VDPO
 from delayrl.core import networks
 from delayrl.core.types import Spec, Window
 
+pytestmark = pytest.mark.thorough  # all together, 40 seconds
+
 ACTIONS = np.linspace(-1, 1, 9)
 PAST = np.array([-1.0, 0.0, 1.0])  # past actions, in histories
 SAC_OPTIONS: dict[str, Any] = {

@@ -106,6 +106,7 @@ def test_bpql_has_a_fixed_point_of_its_own(seed: int) -> None:
     assert np.abs(policy - mixture(belief, softmax(q / temperature))).max() > 0.1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("seed", "policy_gap", "value_gap"), [(0, 0.093, 2.249), (1, 0.183, 6.285), (2, 0.044, 0.605)])
 def test_ad_sac_is_not_vdpo(seed: int, policy_gap: float, value_gap: float) -> None:
     """Its critics hold the lower of two actors' values, so without auxiliary delay Q lies below Q* under noise."""
