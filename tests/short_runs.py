@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import delayrl
 from delayrl.run.folder import Run
+from delayrl.training.loop import Loop
 
 TINY = {
     "steps": 300,
@@ -34,6 +36,26 @@ def train(agent: str, out: Path, **values):
     }
     options |= tiny | values
     return delayrl.train(agent, **options)
+
+
+class KilledError(Exception):
+    """Ends a run where it is."""
+
+
+def killed_and_resumed(agent: str, out: Path, monkeypatch: pytest.MonkeyPatch, **values) -> Run:
+    """Train until step 237, in the middle of an episode, die there, and go on with the same call."""
+    learn = Loop.learn
+
+    def fail(self: Loop):
+        if self.state.step == 237:
+            raise KilledError
+        return learn(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Loop, "learn", fail)
+        with pytest.raises(KilledError):
+            train(agent, out, **values)
+    return train(agent, out, **values)
 
 
 def arrays(run: Run) -> dict[str, np.ndarray]:

@@ -21,8 +21,8 @@ from delayrl.delays import Channel, Constant, Delay, as_delay
 from delayrl.play.evaluation import evaluate
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
-from delayrl.training.loop import Loop, hidden_steps
-from short_runs import arrays, train
+from delayrl.training.loop import hidden_steps
+from short_runs import arrays, killed_and_resumed, train
 from strategies import CHANNELS
 
 DELAYED = [name for name in TINY if name != "sac"]
@@ -94,21 +94,7 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert whole.config["delay"] == delay
     assert {row["delay"] for row in whole.read("rows")} == {delay}
 
-    class KilledError(Exception):
-        pass
-
-    learn = Loop.learn
-
-    def fail(self: Loop):
-        if self.state.step == 237:
-            raise KilledError
-        return learn(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Loop, "learn", fail)
-        with pytest.raises(KilledError):
-            train("a-sac", tmp_path / "cut", delay=delay)
-    cut = train("a-sac", tmp_path / "cut", delay=delay)
+    cut = killed_and_resumed("a-sac", tmp_path / "cut", monkeypatch, delay=delay)
     assert cut.read("rows") == whole.read("rows")
     for name, array in arrays(cut).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])

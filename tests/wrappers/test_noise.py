@@ -11,9 +11,8 @@ import delayrl
 from delayrl.core.protocol import Protocol
 from delayrl.envs.probe import Walk
 from delayrl.training.actor import Actor
-from delayrl.training.loop import Loop
 from delayrl.wrappers import Delayed, NoisyActions
-from short_runs import arrays, train
+from short_runs import arrays, killed_and_resumed, train
 
 gym.register(
     "delayrl/NoisyWalk-v0",
@@ -135,23 +134,9 @@ def test_each_episode_has_noise_of_its_own(start_states, different: int) -> None
 def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Training on a noisy task by its id; in the middle of an episode the run goes on as if uninterrupted."""
 
-    class KilledError(Exception):
-        pass
-
     options = {"env": "delayrl/NoisyReacher-v4", "delay": 2}
     whole = train("bpql", tmp_path / "whole", **options)
-    learn = Loop.learn
-
-    def fail(self: Loop):
-        if self.state.step == 237:
-            raise KilledError
-        return learn(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Loop, "learn", fail)
-        with pytest.raises(KilledError):
-            train("bpql", tmp_path / "cut", **options)
-    cut = train("bpql", tmp_path / "cut", **options)
+    cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, **options)
     assert cut.read("rows") == whole.read("rows")
     for name, array in arrays(cut).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])

@@ -26,7 +26,7 @@ from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
 from delayrl.core.networks import Params
-from delayrl.core.objectives import soft_value
+from delayrl.core.objectives import annealed, soft_value
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
@@ -79,9 +79,9 @@ class AnyAge:
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """Update the critics as BPQL does, and the actor at two ages."""
-        age_key, update_key = jax.random.split(key)
         if self.second_age == "none" or windows.delay == 0:
             return self.bpql.update(state, windows, key, count)
+        age_key, update_key = jax.random.split(key)
         weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
         younger = self.younger(windows, age_key)
         improve = functools.partial(self.improve_actor, younger, weight)
@@ -116,5 +116,4 @@ class AnyAge:
 
     def weight(self, step: Int[Array, ""]) -> Float[Array, ""]:
         """Return w(t), which is constant at first, then falls linearly to 0 and stays there."""
-        hold, end = self.pull_hold * self.run_steps, self.pull_end * self.run_steps
-        return self.pull_weight * jnp.clip((end - step) / max(end - hold, 1), 0.0, 1.0)
+        return self.pull_weight * annealed(step, self.pull_hold * self.run_steps, self.pull_end * self.run_steps)

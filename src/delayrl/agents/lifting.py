@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase, Schedule
 from delayrl.core.networks import Gaussian
+from delayrl.core.objectives import annealed
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import look
 from delayrl.errors import DelayRLError
@@ -117,8 +118,7 @@ class Lifting:
 
     def weight(self, step: Int[Array, ""]) -> Float[Array, ""]:
         """Return w(t), which is constant at first, then falls linearly to 0 and stays there."""
-        left = (self.lifting_end - step) / max(self.lifting_end - self.lifting_hold, 1)
-        return self.lifting_weight * jnp.clip(left, 0.0, 1.0)
+        return self.lifting_weight * annealed(step, self.lifting_hold, self.lifting_end)
 
 
 def lifting_loss(delayed: Gaussian, reference: Gaussian) -> Float[Array, ""]:

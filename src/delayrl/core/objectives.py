@@ -38,6 +38,11 @@ def temperature_loss(
     return -(jnp.exp(log_temperature) * (log_prob + target_entropy)).mean()
 
 
+def annealed(step: Int[Array, ""], hold: int | float, end: int | float) -> Float[Array, ""]:
+    """Return 1 up to step `hold`, from there on a line that falls to 0 at step `end`, and 0 after it."""
+    return jnp.clip((end - step) / max(end - hold, 1), 0.0, 1.0)
+
+
 def gaussian_kl(p: Gaussian, q: Gaussian) -> Float[Array, "*batch action"]:
     """Return KL(p‖q) of diagonal Gaussians for each dimension. Squashing both with tanh does not change it."""
     variance, difference = jnp.exp(2 * p.log_std), p.mean - q.mean

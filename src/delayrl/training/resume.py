@@ -45,10 +45,11 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
             raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
     checkpoints = _common_checkpoints(runs, note)
     config |= {"configuration": group.setup.configuration, "versions": versions()}
+    if not all(run.exists for run in runs):
+        config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
     for run, seed in zip(runs, group.seeds, strict=True):
         if not run.exists:
-            cost = cost_of(group.setup.agent, group.spec, group.setup.schedule)
-            run.create(config | {"seed": seed, "cost": cost.json})
+            run.create(config | {"seed": seed})
     learner = group.program.init(group.keys, group.replay_rows)
     state = TrainState(0, learner, actors, [], None, [{} for _ in runs], [(0, 0) for _ in runs])
     if not checkpoints:
@@ -86,9 +87,10 @@ def _common_checkpoints(runs: list[Run], note: Callable[[str], None]) -> list[Ch
 def _check_same(run: Run, wanted: dict[str, Any]) -> None:
     """Raise DelayRLError if a folder holds a run with another configuration."""
     stored = run.config
+    added_later = {**values_of(Schedule()), **OLDER}
     for key, value in wanted.items():
         if isinstance(value, dict):
-            known = {**values_of(Schedule()), **OLDER, **stored.get(key, {})}
+            known = added_later | stored.get(key, {})
             changed = [name for name in value if known.get(name) != value[name]]
         else:
             changed = [key] if stored.get(key) != value else []

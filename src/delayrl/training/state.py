@@ -26,8 +26,12 @@ class Group:
     spec: Spec
     template: State  # shapes and types of the agent's state
     program: Program
-    replay_rows: int
     apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other
+
+    @property
+    def replay_rows(self) -> int:
+        """The rows of each seed's replay."""
+        return self.setup.schedule.replay_capacity // self.setup.entries(self.spec)
 
 
 @dataclass

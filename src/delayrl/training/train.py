@@ -90,8 +90,7 @@ def train(
         actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
-        rows = setup.schedule.replay_capacity // setup.entries(spec)
-        group = Group(setup, numbers, runs, keys, spec, shapes, program, rows, pool.map if threads > 1 else map)
+        group = Group(setup, numbers, runs, keys, spec, shapes, program, pool.map if threads > 1 else map)
 
         def note(line: str) -> None:
             if progress:
@@ -117,9 +116,9 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
     agent, schedule, spec, task = setup.agent, setup.schedule, spec_of(env), env.spec
     least = 2 * (spec.delay + agent.ahead(spec)) + 2
-    for name, units in (("replay_capacity", setup.entries(spec)), ("random_steps", 1), ("update_after", 1)):
-        if getattr(schedule, name) < least * units and (name, schedule.update_after) != ("update_after", 0):
-            raise DelayRLError(f"{name} must be at least {least * units} here; got {getattr(schedule, name)}")
+    for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
+        if getattr(schedule, name) < count:
+            raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")

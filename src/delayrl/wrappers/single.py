@@ -42,6 +42,15 @@ def seconds_of(env: Any) -> float | None:
     return None
 
 
+def is_delayed(env: Any) -> bool:
+    """Return whether an environment, or one of those that it wraps, is a `Delayed`."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, Delayed):
+            return True
+        env = env.env
+    return False
+
+
 def check_length(delay: Delay, spec: Any) -> None:
     """Raise DelayRLError if a delay is longer than an episode of the task with this spec (None: unknown)."""
     limit = spec.max_episode_steps if spec is not None else None
@@ -115,11 +124,8 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
-        inner: Any = env
-        while isinstance(inner, gym.Wrapper):
-            if isinstance(inner, Delayed):
-                raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
-            inner = inner.env
+        if is_delayed(env):
+            raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
         self.delay = as_delay(delay, seconds_of(env) if step_seconds is None else step_seconds)
