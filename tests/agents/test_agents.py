@@ -10,6 +10,7 @@ import pytest
 from learning import ACT, DELAYED, ENV, OBS, program_of, same, seen, trained
 
 from conftest import TINY, learned, quick, record
+from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.random import Random
 from delayrl.agents.registry import AGENTS
 from delayrl.core.types import Seen, Spec
@@ -19,6 +20,8 @@ PRIVILEGED = {name for name in DELAYED if TINY[name].privileged}
 HONEST = {name: TINY[name] for name in DELAYED if name not in PRIVILEGED} | {
     "vdpo, behaviour delayed": dataclasses.replace(TINY["vdpo"], behaviour="delayed"),
     "ad-sac, behaviour augmented": dataclasses.replace(TINY["ad-sac"], behaviour="augmented"),
+    "bpql, normalised observations": NormalisedObservations(TINY["bpql"]),
+    "any-age, transformer": dataclasses.replace(TINY["any-age"], encoder="transformer", belief_weight=1.0),
     "ad-sac, auxiliary delay 1": dataclasses.replace(TINY["ad-sac"], auxiliary_delay=1),
 }
 

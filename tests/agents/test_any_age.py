@@ -6,16 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, OBS, counted, random_windows, record, same, trained
+from learning import ACT, OBS, counted, random_windows, record, same, seen, trained
 
 from conftest import TINY
-from delayrl.agents.any_age import AnyAge
+from delayrl.agents.any_age import AnyAge, belief_loss
 from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.objectives import soft_value
+from delayrl.core.sequence import sequence
 from delayrl.core.types import Spec
+from delayrl.core.views import network_input
 from delayrl.errors import DelayRLError
 
 AGENT = TINY["any-age"]
@@ -54,8 +56,10 @@ def test_younger_views() -> None:
         assert ((counts - expected) ** 2 / expected).sum() < age + 6 * np.sqrt(2 * max(age, 1))
 
 
-def test_actor_gradient_by_hand() -> None:
+@pytest.mark.parametrize("distance", ["moments", "kl"])
+def test_actor_gradient_by_hand(distance: str) -> None:
     """Half for each age, and the pull of the older policy towards the younger, which is held fixed."""
+    agent = replace(AGENT, pull=distance)
     transitions, _ = record("Reacher-v5", 3, 80)
     replay = ring.init(Spec(OBS, ACT, 3), 200)
     for transition in transitions:
@@ -65,7 +69,7 @@ def test_actor_gradient_by_hand() -> None:
     older, critic_input = AGENT.bpql._inputs(windows, 0)
     younger = AGENT.younger(windows, jax.random.key(2))
     assert not np.allclose(older, younger)
-    moved = AGENT.improve_actor(younger, jnp.float32(3.0), state, older, critic_input, jax.random.key(5))
+    moved = agent.improve_actor(windows, younger, jnp.float32(3.0), state, older, critic_input, jax.random.key(5))
     frozen = AGENT.bpql.policy(state.actor, younger)
 
     def value(actor, x, key):
@@ -75,7 +79,12 @@ def test_actor_gradient_by_hand() -> None:
         ).mean()
 
     def pull(actor):
-        return lifting_loss(AGENT.bpql.policy(actor, older), frozen)
+        policy = AGENT.bpql.policy(actor, older)
+        if distance == "moments":
+            return lifting_loss(policy, frozen)
+        scale = jnp.exp(policy.log_std - frozen.log_std)
+        apart = (policy.mean - frozen.mean) / jnp.exp(frozen.log_std)
+        return (-jnp.log(scale) + 0.5 * (scale**2 + apart**2 - 1)).sum(-1).mean()
 
     keys = jax.random.split(jax.random.key(5))
     parts = [jax.grad(value)(state.actor, x, key) for x, key in zip((older, younger), keys, strict=True)]
@@ -104,6 +113,57 @@ def test_clock_is_the_environment_step() -> None:
     for count, weight in ((2, 2.0), (3, 2.0), (4, 1.0), (5, 1.0), (6, 0.0)):
         _, metrics = update(state, random_windows(spec), jax.random.key(1), jnp.int32(count))
         np.testing.assert_allclose(metrics["pull_weight"], weight)
+
+
+SEQUENTIAL = replace(AGENT, encoder="transformer", encoder_width=8, belief_weight=0.5)
+
+
+def test_a_sequence_is_read_at_its_age(rng: np.random.Generator) -> None:
+    """Actions after the first `age` do not matter, all others do; at age 0 the observation alone is read."""
+    state = SEQUENTIAL.init(Spec(OBS, ACT, 4), jax.random.key(0))
+    for age in range(5):
+        x = seen(4, age, rng)
+        action = SEQUENTIAL.act(state, x, jax.random.key(0), explore=False)
+        later = x._replace(actions=x.actions.at[age:].set(0.7))
+        np.testing.assert_array_equal(action, SEQUENTIAL.act(state, later, jax.random.key(0), explore=False))
+        for used in range(age):
+            other = x._replace(actions=x.actions.at[used].add(0.3))
+            assert not np.array_equal(action, SEQUENTIAL.act(state, other, jax.random.key(0), explore=False))
+    fresh = seen(4, 0, rng)
+    expected = networks.mlp(state.actor["current"], fresh.obs)
+    np.testing.assert_array_equal(sequence(state.actor, network_input(fresh, "augmented")), expected)
+
+
+def test_a_sequence_without_a_delay_is_sac() -> None:
+    plain = replace(SEQUENTIAL, second_age="none", belief_weight=0.0)
+    for agent in (SEQUENTIAL, plain):
+        assert same(trained(agent, 0)[0].agent, trained(replace(AGENT.bpql, actor_sees="current"), 0)[0].agent)
+
+
+def test_belief_by_hand() -> None:
+    """On the counter, whose state rises by 1: the token of i actions is to say i / deviation. Nothing else learns."""
+    _, windows = counted(4, 300, batch=500, ahead=1)
+    spec = Spec(2, 1, 4)
+    state = SEQUENTIAL.init(spec, jax.random.key(0))
+    x = SEQUENTIAL.younger(windows, jax.random.key(0))  # any inputs of the right shape
+    silent = state.actor | {"belief": jax.tree.map(jnp.zeros_like, state.actor["belief"])}
+    ages = np.asarray(windows.age[:, 4])
+    changes = np.array([i for age in ages for i in range(1, age + 1)])
+    deviation = np.sqrt((changes**2).mean())
+    silence = ((changes / deviation) ** 2).sum() / 2 / (500 * 4)  # 2 entries, of which the length never changes
+    np.testing.assert_allclose(belief_loss(silent, x, windows), silence, rtol=1e-4)
+    told = silent["belief"] | {"b": jnp.array([2.0, 0.0])}
+    constant = ((changes / deviation - 2) ** 2).sum() / 2 / (500 * 4)
+    np.testing.assert_allclose(belief_loss(silent | {"belief": told}, x, windows), constant, rtol=1e-4)
+    gradient = jax.grad(belief_loss)(state.actor, x, windows)
+    moved = {name for name, part in gradient.items() if any(jnp.abs(leaf).max() > 0 for leaf in jax.tree.leaves(part))}
+    assert moved == {"encoder", "belief"}
+
+
+@pytest.mark.parametrize("wrong", [{"encoder": "mlp"}, {"second_age": "none"}])
+def test_a_belief_needs_a_sequence_and_a_second_age(wrong: dict) -> None:
+    with pytest.raises(DelayRLError, match="belief_weight needs encoder=transformer and a second_age"):
+        replace(SEQUENTIAL, **wrong).for_run(Schedule())
 
 
 def test_normed_critics() -> None:

@@ -5,7 +5,17 @@ import pytest
 from delayrl.agents.registry import AGENTS
 from delayrl.run.configuration import values_of
 
-ANY_AGE = {"second_age": "random", "pull_weight": 1.0, "pull_hold": 0.25, "pull_end": 0.75}
+ANY_AGE = {
+    "second_age": "random",
+    "pull": "moments",
+    "pull_weight": 1.0,
+    "pull_hold": 0.25,
+    "pull_end": 0.75,
+    "encoder": "mlp",
+    "encoder_width": 64,
+    "encoder_layers": 2,
+    "belief_weight": 0.0,
+}
 VDPO_SAC = {  # VDPO: appendix, table of hyperparameters; log-std, n-step, actor_updates, start: its released code
     "hidden": [256, 256],
     "critic_norm": "none",
@@ -56,6 +66,7 @@ SCHEDULE = {
     "evaluation_episodes": 10,
     "updates_per_call": 1,
     "precision": "float32",
+    "observation_norm": "none",
 }
 PAPER = {
     "vdpo": VDPO_SAC

@@ -9,6 +9,7 @@ import numpy as np
 
 from conftest import TINY, TINY_SAC
 from delayrl.agents.base import Agent, template
+from delayrl.agents.normalised import Moments, NormalisedObservations
 from delayrl.agents.registry import AGENTS as REGISTRY
 from delayrl.core.types import Spec
 from delayrl.deploy.export import bundle_files
@@ -20,6 +21,8 @@ from delayrl.run.folder import Run
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
+AGENTS["any-age, transformer"] = replace(TINY["any-age"], encoder="transformer", encoder_width=8)
+AGENTS |= {f"{name}, normalised": NormalisedObservations(TINY[name]) for name in ("bpql", "vdpo")}
 DELAY = 4
 OBS, LOW, HIGH = 10, np.array([-0.4, -2.0], np.float32), np.array([0.4, 3.0], np.float32)
 """Reacher's sizes; a range of actions that is neither symmetric nor the same for all."""
@@ -35,7 +38,11 @@ def random_state(agent: Agent, spec: Spec, seed: int = 0) -> Any:
         inputs = leaf.shape[0] if len(leaf.shape) > 1 else 16
         return (1.5 * random.normal(size=leaf.shape) * inputs**-0.5).astype(leaf.dtype)
 
-    return jax.tree.map(fill, template(agent, spec))
+    state = jax.tree.map(fill, template(agent, spec))
+    if isinstance(agent, NormalisedObservations):
+        mean, squares = random.normal(size=(2, spec.obs_size)).astype(np.float32)
+        state = state._replace(moments=Moments(np.float32(50), mean, 50 * np.abs(squares)))
+    return state
 
 
 def policy_of(name: str, seed: int = 0) -> Policy:

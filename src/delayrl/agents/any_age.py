@@ -25,13 +25,16 @@ from delayrl.agents.base import Agent, Deterministic, Phase, Schedule, descend
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
-from delayrl.core.networks import Params
-from delayrl.core.objectives import annealed, soft_value
+from delayrl.core.networks import Gaussian, Params
+from delayrl.core.objectives import annealed, gaussian_kl, masked_mean, soft_value
+from delayrl.core.sequence import flat_or_sequence, sequence_init, tokens
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
 
 SecondAge = Literal["none", "random", "zero"]
+Pull = Literal["moments", "kl"]
+Encoder = Literal["mlp", "transformer"]
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,14 @@ class AnyAge:
 
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, critic_norm="layer"))
     second_age: Annotated[SecondAge, "the younger age that the actor learns at too: random in 0..d, or 0"] = "random"
+    pull: Annotated[Pull, "distance of the two policies: that of lifting's moments, or KL(older‖younger)"] = "moments"
     pull_weight: Annotated[float, "initial weight of the pull towards the younger age", (0.0, 1e6)] = 1.0
     pull_hold: Annotated[float, "part of the run in which the weight stays constant", (0.0, 1.0)] = 0.25
     pull_end: Annotated[float, "part of the run after which the weight, falling linearly, is 0", (0.0, 1.0)] = 0.75
+    encoder: Annotated[Encoder, "how the actor reads x_t: as one vector, or by VDPO's transformer"] = "mlp"
+    encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
+    encoder_layers: Annotated[int, "transformer blocks"] = 2
+    belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
     run_steps: Annotated[int, "fixed"] = 0  # environment steps of the run, from its schedule
 
     privileged = False
@@ -60,32 +68,48 @@ class AnyAge:
         return None
 
     def for_run(self, schedule: Schedule) -> "AnyAge":
-        """Return the agent with the length of its run. Raises DelayRLError if the weight falls before it is held."""
+        """Return the agent with the length of its run. Raises DelayRLError for options that contradict each other."""
         if self.pull_hold > self.pull_end:
             raise DelayRLError(f"pull_hold must be no later than pull_end, {self.pull_end}; got {self.pull_hold}")
+        if self.belief_weight and (self.encoder == "mlp" or self.second_age == "none"):
+            raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
         return replace(self, run_steps=schedule.steps)
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Initialise as BPQL."""
-        return self.bpql.init(spec, key)
+        """Initialise as BPQL, but for an actor that reads a sequence; without a delay there is none to read."""
+        state = self.bpql.init(spec, key)
+        if self.encoder == "mlp" or spec.delay == 0:
+            return state
+        actor_key, belief_key = jax.random.split(jax.random.fold_in(key, 1))
+        sizes = self.encoder_width, self.encoder_layers, self.bpql.hidden, 2 * spec.action_size
+        actor = sequence_init(actor_key, spec, *sizes)
+        if self.belief_weight:
+            actor["belief"] = networks.linear_init(belief_key, self.encoder_width, spec.obs_size)
+        return state._replace(actor=actor, actor_opt_state=optax.adam(self.bpql.actor_learning_rate).init(actor))
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """Sample the policy at the shown age, or return its mode."""
-        return self.bpql.act(state, seen, key, explore=explore)
+        return self.learner.act(state, seen, key, explore=explore)
 
     def deterministic(self, state: State) -> Deterministic:
         """Return the actor."""
+        if isinstance(state.actor, dict):
+            return Deterministic("augmented", state.actor["head"], state.actor["encoder"], state.actor["current"])
         return self.bpql.deterministic(state)
+
+    @property
+    def learner(self) -> sac.SAC:
+        """BPQL with an actor of either kind."""
+        return replace(self.bpql, actor_network=flat_or_sequence)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """Update the critics as BPQL does, and the actor at two ages."""
         if self.second_age == "none" or windows.delay == 0:
-            return self.bpql.update(state, windows, key, count)
+            return self.learner.update(state, windows, key, count)
         age_key, update_key = jax.random.split(key)
         weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
-        younger = self.younger(windows, age_key)
-        improve = functools.partial(self.improve_actor, younger, weight)
-        state, metrics = self.bpql.update(state, windows, update_key, count, improve)
+        improve = functools.partial(self.improve_actor, windows, self.younger(windows, age_key), weight)
+        state, metrics = self.learner.update(state, windows, update_key, count, improve)
         return state, metrics | {"pull_weight": weight}
 
     def younger(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
@@ -96,24 +120,56 @@ class AnyAge:
         return jax.vmap(lambda window, age: network_input(view(window, age=age), "augmented"))(windows, ages)
 
     def improve_actor(
-        self, younger: Array, weight: Array, state: State, actor_input: Array, critic_input: Array, key: Key
+        self,
+        windows: Window,
+        younger: Array,
+        weight: Array,
+        state: State,
+        actor_input: Array,
+        critic_input: Array,
+        key: Key,
     ) -> State:
-        """Take one gradient step on the actor: half for each age, and the pull of the older one."""
+        """Take one gradient step on the actor: half for each age, the pull of the older one, and the belief's loss."""
         temperature, keys = jnp.exp(state.log_temperature), jax.random.split(key)
 
         def loss(actor: Params) -> tuple[Array, None]:
-            older, other = self.bpql.policy(actor, actor_input), self.bpql.policy(actor, younger)
-            total = weight * lifting_loss(older, other)
+            older, other = self.learner.policy(actor, actor_input), self.learner.policy(actor, younger)
+            total = weight * self.distance(older, other)
             for policy, sample_key in zip((older, other), keys, strict=True):
                 action, log_prob = networks.sample(policy, sample_key)
                 q = networks.twin(state.critic, critic_input, action)
                 total -= 0.5 * soft_value(q, log_prob, temperature).mean()
+            if self.belief_weight:
+                total += self.belief_weight * belief_loss(actor, actor_input, windows)
             return total, None
 
         adam = optax.adam(self.bpql.actor_learning_rate)
         actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)
         return state._replace(actor=actor, actor_opt_state=opt_state)
 
+    def distance(self, older: Gaussian, younger: Gaussian) -> Float[Array, ""]:
+        """Return how far the older policy is from the younger one, which is held fixed."""
+        if self.pull == "moments":
+            return lifting_loss(older, younger)
+        return gaussian_kl(older, jax.lax.stop_gradient(younger)).sum(-1).mean()
+
     def weight(self, step: Int[Array, ""]) -> Float[Array, ""]:
         """Return w(t), which is constant at first, then falls linearly to 0 and stays there."""
         return self.pull_weight * annealed(step, self.pull_hold * self.run_steps, self.pull_end * self.run_steps)
+
+
+def belief_loss(actor: Params, x: Float[Array, "batch input"], windows: Window) -> Float[Array, ""]:
+    """Return the mean squared error of the states that x_t hides, as differences from s_{t-d} in their own deviations.
+
+    Token i predicts the state i + 1 steps after s_{t-d}; the deviation of each dimension is the batch's.
+    """
+    now, slots = windows.delay, jnp.arange(windows.delay)
+    age = windows.age[:, now]
+    hidden = slots < age[:, None]
+    rows = jnp.minimum((now - age)[:, None] + slots + 1, now)
+    states = jnp.take_along_axis(windows.obs, rows[..., None], 1)
+    seen = jnp.take_along_axis(windows.obs, (now - age)[:, None, None], 1)
+    change = jnp.where(hidden[..., None], states - seen, 0)
+    deviation = jnp.sqrt((change**2).sum((0, 1)) / jnp.maximum(hidden.sum(), 1) + 1e-8)
+    errors = networks.linear(actor["belief"], tokens(actor, x)) - change / deviation
+    return masked_mean((errors**2).mean(-1), hidden)

@@ -14,6 +14,7 @@ from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import Sees
 
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
+ObservationNorm = Literal["none", "running"]
 PRODUCTS: Mapping[Precision, str] = {
     "float32": "float32",
     "tensorfloat32": "tensorfloat32",
@@ -95,6 +96,7 @@ class Schedule:
     evaluation_episodes: Annotated[int, "episodes per evaluation"] = 10
     updates_per_call: Annotated[int, "environment steps between calls to learn, which run all updates due"] = 1
     precision: Annotated[Precision, "precision of matrix products, where the device offers a choice"] = "float32"
+    observation_norm: Annotated[ObservationNorm, "running: networks see deviations from a running mean"] = "none"
 
     @property
     def first_update(self) -> int:

@@ -80,6 +80,7 @@ class SAC:
     batch_size: Annotated[int, "windows per batch"] = 256
     update_every: Annotated[int, "environment steps between rounds of updates"] = 1
     updates: Annotated[int, "updates per round"] = 1
+    actor_network: Annotated[networks.Network, "fixed"] = networks.mlp  # agents built on SAC may have another
 
     privileged = False
 
@@ -120,7 +121,7 @@ class SAC:
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
         """Return the actor's Gaussian at inputs `x`."""
-        return networks.gaussian(actor, x, self.log_std_range, self.log_std_bounds)
+        return networks.gaussian(actor, x, self.log_std_range, self.log_std_bounds, self.actor_network)
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """Sample the policy, or return its mode."""

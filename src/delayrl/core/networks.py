@@ -13,6 +13,8 @@ from delayrl.core.types import Key
 
 Params = Any
 """A pytree (dicts and lists) of arrays."""
+Network = Callable[[Params, Array], Array]
+"""A function from parameters and inputs to outputs, as `mlp`."""
 LogStdBounds = Literal["rescale", "clip"]
 Norm = Literal["none", "layer"]
 
@@ -92,9 +94,10 @@ def gaussian(
     x: Float[Array, "*batch inputs"],
     log_std_range: tuple[float, float],
     bounds: LogStdBounds = "rescale",
+    network: Network | None = None,
 ) -> Gaussian:
-    """Return the Gaussian that an `mlp` outputs, with its log-std kept in range by a rescaled tanh or by clipping."""
-    mean, log_std = jnp.split(mlp(params, x), 2, -1)
+    """Return the Gaussian that `mlp`, or another network, outputs; a rescaled tanh or clipping bounds its log-std."""
+    mean, log_std = jnp.split((network or mlp)(params, x), 2, -1)
     low, high = log_std_range
     if bounds == "rescale":
         return Gaussian(mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1))

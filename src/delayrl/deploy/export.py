@@ -89,7 +89,9 @@ def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
         "observation": _space(env.observation_space),
         "action": _space(env.action_space),
         "normalisation": {
-            "observation": "none: the task's own numbers",
+            "observation": "inside the first layers: the bundle takes the task's own numbers"
+            if config["schedule"].get("observation_norm") == "running"
+            else "none: the task's own numbers",
             "action": "inside, low .. high is -1 .. 1; the bundle takes and gives the task's own units",
         },
         "step": step,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
+from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import find_agent
 from delayrl.core.protocol import Protocol, opening_length
 from delayrl.core.replay import Learnable
@@ -133,6 +134,8 @@ def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, 
     made = override(base.agent, values)
     if for_run := getattr(made, "for_run", None):
         made = for_run(schedule)
+    if schedule.observation_norm == "running":
+        made = NormalisedObservations(made)
     return Setup(condition, made, schedule, parsed, chosen)
 
 
@@ -156,4 +159,5 @@ def agent_of(config: Mapping[str, Any]) -> Agent:
     except (KeyError, DelayRLError) as error:
         raise DelayRLError(f"the run's configuration names an unknown agent or preset: {error}") from error
     check_names(config["hyperparameters"], agent)
-    return override(agent, {**OLDER, **config["hyperparameters"]})  # type: ignore[no-any-return]
+    agent = override(agent, {**OLDER, **config["hyperparameters"]})
+    return NormalisedObservations(agent) if config["schedule"].get("observation_norm") == "running" else agent

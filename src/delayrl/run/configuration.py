@@ -12,9 +12,15 @@ OLDER: Mapping[str, Any] = {
     "entropy_unit": "scaled",
     "at_age_0": "reference",
     "critic_norm": "none",
+    "pull": "moments",
+    "encoder": "mlp",
+    "encoder_width": 64,
+    "encoder_layers": 2,
+    "belief_weight": 0.0,
     "student_optimiser": "rmsprop",
     "temperature": "fixed",
     "update_after": 0,
+    "observation_norm": "none",
 }
 """Options that were added later, with what an older configuration means that does not mention them."""
 

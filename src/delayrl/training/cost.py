@@ -16,7 +16,7 @@ from delayrl.core.types import Spec
 from delayrl.run.cost import Cost
 from delayrl.training.products import Value, follow, traced_updates
 
-OPTIMISER = re.compile(r"((?:\w+\.)*?)(?:(\w+)_)?opt_state\..*")
+OPTIMISER = re.compile(r"(?:agent\.)?((?:\w+\.)*?)(?:(\w+)_)?opt_state\..*")
 """The names of the leaves of an optimiser's state, within an agent's."""
 STRIDE = 101  # a prime, so that what happens at every second or fourth update is seen as often as it happens
 
@@ -28,7 +28,7 @@ def cost_of(agent: Agent, spec: Spec, schedule: Schedule) -> Cost:
     changes its state.
     """
     leaves = _named_leaves(template(agent, spec))
-    trained = [x for name, x in leaves if not OPTIMISER.fullmatch(name) and "target" not in name.split(".")]
+    trained = [x for name, x in leaves if not (OPTIMISER.fullmatch(name) or {"target", "moments"} & {*name.split(".")})]
     parameters = sum(math.prod(x.shape) for x in trained if jnp.issubdtype(x.dtype, jnp.floating))
     counters = _counters(leaves)
     flops, steps = 0.0, dict.fromkeys(counters.values(), 0.0)

@@ -1,0 +1,44 @@
+"""A policy network that reads x_t as a sequence: VDPO's transformer, a head on its output, and an MLP for age 0."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from delayrl.core.networks import Params, mlp, mlp_init
+from delayrl.core.transformer import transformer, transformer_init
+from delayrl.core.types import Key, Spec
+from delayrl.core.views import split_input
+
+
+def sequence_init(key: Key, spec: Spec, width: int, layers: int, hidden: tuple[int, ...], outputs: int) -> Params:
+    """Initialise the encoder as VDPO's, the head on it and the MLP `current`, both with these hidden layers."""
+    encoder_key, head_key, current_key = jax.random.split(key, 3)
+    return {
+        "encoder": transformer_init(encoder_key, spec.obs_size, spec.action_size, spec.delay, width, layers),
+        "head": mlp_init(head_key, (width, *hidden, outputs)),
+        "current": mlp_init(current_key, (spec.obs_size, *hidden, outputs)),
+    }
+
+
+def flat_or_sequence(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
+    """Apply parameters of `sequence_init`, or else of `mlp_init`."""
+    return sequence(params, x) if isinstance(params, dict) else mlp(params, x)
+
+
+def sequence(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
+    """Apply the head to what the encoder says at the age of x_t, or at age 0 `current` to the observation."""
+    obs, _, age = _parts(params, x)
+    row = jnp.maximum(age - 1, 0)[..., None, None]  # token i serves the age i + 1
+    at_age = jnp.take_along_axis(tokens(params, x), row, -2)[..., 0, :]
+    return jnp.where(age[..., None] > 0, mlp(params["head"], at_age), mlp(params["current"], obs))
+
+
+def tokens(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch delay width"]:
+    """Return the encoder's output at each age 1..Δ."""
+    obs, actions, _ = _parts(params, x)
+    return transformer(params["encoder"], obs, actions)
+
+
+def _parts(params: Params, x: Array) -> tuple[Array, Array, Array]:
+    """Return observation, actions and age of x_t; the encoder's shapes tell the longest age."""
+    return split_input(x, len(params["encoder"]["position"]), len(params["encoder"]["action"]["w"]))
