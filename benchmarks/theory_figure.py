@@ -338,6 +338,21 @@ def minimum_numbers(count: int = 4) -> None:
         row(f"seed {seed}", [*gaps, *values, *returns, tab.optimal_return(delayed.mdp)])
 
 
+def any_age_numbers() -> None:
+    heading("Any-age at constant weight: return at age 0; late: no pull; KL 10; squares 0.1, 1, 10; best; then gaps")
+    print(" " * 4 + "gaps: largest difference in probability from no pull, of KL 10 and squares 0.1, 1, 10")
+    problems = [(f"random MDP {seed}", tab.random_mdp(np.random.default_rng(seed)), 2, 0.3) for seed in range(4)]
+    problems += [(f"tracking, delay {delay}", tab.tracking(), delay, 0.1) for delay in (1, 2, 3)]
+    for name, mdp, delay, temperature in problems:
+        delayed, bpql = tab.augment(mdp, delay), fix.bpql_fixed_point(mdp, delay, temperature)
+        pulls: list[tuple[float, fix.Distance]] = [(10.0, "kl"), *((w, "squares") for w in (0.1, 1.0, 10.0))]
+        pulled = [fix.any_age_fixed_point(mdp, delay, temperature, *pull).policy for pull in pulls]
+        returns = [tab.policy_return(delayed.mdp, policy) for policy in (bpql.policy, *pulled)]
+        fresh = tab.policy_return(mdp, tab.softmax(bpql.q / temperature))
+        row(name, [fresh, *returns, tab.optimal_return(delayed.mdp)])
+        row("", [np.abs(policy - bpql.policy).max() for policy in pulled])
+
+
 def released_adsac(mdp: tab.MDP, delay: int, temperature: float) -> Array | None:
     """Return AD-SAC's policy on the data of its released rule for acting; None where policy and data only cycle."""
     try:
@@ -438,6 +453,7 @@ def main() -> None:
     fixed_point_numbers()
     direction_numbers()
     minimum_numbers()
+    any_age_numbers()
 
     figure, panel = plt.subplots(figsize=(8.5, 5.4), layout="constrained")
     random_mdps(panel)

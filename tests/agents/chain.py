@@ -105,6 +105,45 @@ def improve(q: jax.Array, policy: Policy) -> Policy:
     return policy
 
 
+def squashed(policy: Policy) -> tuple[jax.Array, jax.Array]:
+    """Return mean and deviation of the actions of each Gaussian, (N,)."""
+    actions, _ = act(policy)
+    return actions.mean(-1), actions.std(-1)
+
+
+def pulled(belief: jax.Array, weight: float, distance: str) -> Callable[[jax.Array, Policy, Policy], Policy]:
+    """Return any-age's improvement of the late policy: half the soft value, and the pull to the policy on s_t.
+
+    `moments` is lifting's distance, `kl` KL(late‖current); both averaged over the belief, (X, S).
+    """
+
+    def apart(late: Policy, current: Policy) -> jax.Array:
+        if distance == "moments":
+            pairs = zip(squashed(late), squashed(current), strict=True)
+            return sum((one[:, None] - other) ** 2 for one, other in pairs)  # type: ignore[return-value]
+        scale = jnp.exp(late.log_std)[:, None] / jnp.exp(current.log_std)
+        shift = (late.mean[:, None] - current.mean) / jnp.exp(current.log_std)
+        return -jnp.log(scale) + 0.5 * (scale**2 + shift**2 - 1)
+
+    @jax.jit
+    def improve_late(q: jax.Array, late: Policy, current: Policy) -> Policy:
+        adam = optax.adam(0.03)
+
+        def loss(late: Policy) -> jax.Array:
+            pull = (belief * apart(late, current)).sum(-1)
+            return (weight * pull - 0.5 * soft_values(belief @ q, late).mean(-1)).sum()
+
+        def step(carry: Any, _: None) -> Any:
+            late, opt_state = carry
+            change, opt_state = adam.update(jax.grad(loss)(late), opt_state)
+            return (optax.apply_updates(late, change), opt_state), None
+
+        (late, _), _ = jax.lax.scan(step, (late, adam.init(late)), None, 100)
+        return late
+
+    return improve_late
+
+
 @dataclass(frozen=True)
 class Solution:
     """A fixed point.
@@ -140,17 +179,19 @@ def adsac_value(current: jax.Array, late: jax.Array) -> jax.Array:
     return jnp.minimum(current[..., None, :], late[..., :, None]).mean((-2, -1))
 
 
-def solve(value: Value, sweeps: int = 60) -> Solution:
-    """Iterate Q = R + γ E V and both policies' improvements until they settle."""
+def solve(value: Value, sweeps: int = 60, pull: tuple[float, str] | None = None) -> Solution:
+    """Iterate Q = R + γ E V and both policies' improvements until they settle, the late one's with a pull if given."""
     dynamics = jnp.asarray(transition(GRID))
     belief = dynamics.reshape(-1, STATES)  # of s_t given x_t
+    improve_late = pulled(belief, *pull) if pull else lambda q, late, current: improve(belief @ q, late)
     size = len(GRID)
     q = jnp.asarray(reward(GRID))
     current, late = (Policy(jnp.zeros(n), jnp.zeros(n)) for n in (STATES, STATES * size))
 
     @jax.jit
     def sweep(q: jax.Array, current: Policy, late: Policy) -> tuple[jax.Array, Policy, Policy]:
-        current, late = improve(q, current), improve(belief @ q, late)
+        current = improve(q, current)
+        late = improve_late(q, late, current)
         at = jax.vmap(lambda row: soft_values(jnp.broadcast_to(row, (STATES * size, size)), late))(q)  # (3, X, K)
         late_values = jnp.moveaxis(at, 0, 1).reshape(STATES, size, STATES, -1)
         v = value(soft_values(q, current), late_values)

@@ -4,9 +4,11 @@ The same letters for shapes as in tabular.py, and Z for the histories of a short
 averages over what it does not see *in its data*, so each fixed point belongs to a behaviour.
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.special import wrightomega
 from tabular import (
     MDP,
     Array,
@@ -122,6 +124,53 @@ def bpql_fixed_point(mdp: MDP, delay: int, temperature: float) -> ActorCritic:
     return actor_critic_fixed_point(mdp, delay, temperature, shorter=0, data="delayed", lower=False)
 
 
+Distance = Literal["squares", "kl"]
+
+
+def any_age_fixed_point(mdp: MDP, delay: int, temperature: float, weight: float, distance: Distance) -> ActorCritic:
+    """Return where any-age settles while its pull towards age 0 has a constant weight.
+
+    Its critics are BPQL's. Its late actor minimises ½ E_b[α log π_Δ - Q] + w E_b D(π_Δ, π_0), where the policy at age 0
+    sees s_t and is soft-greedy for the same Q. `squares` are squared differences of probabilities, the table's
+    counterpart of lifting's squared differences of moments.
+    """
+
+    def improve(belief: Array, q: Array) -> Array:
+        free, averaged = softmax(q / temperature), belief @ q
+        if distance == "kl":
+            return pulled_by_kl(averaged, belief @ np.log(free), temperature, weight)
+        return pulled_by_squares(averaged, belief @ free, temperature, weight)
+
+    return actor_critic_fixed_point(mdp, delay, temperature, shorter=0, data="delayed", lower=False, improve=improve)
+
+
+def pulled_by_kl(averaged: Array, log_free: Array, temperature: float, weight: float) -> Array:
+    """Minimise ½(α log π - Q) + w KL(π ‖ π_j) on average, given E[Q | x] and E[log π_j | x], all of shape (X, A)."""
+    return softmax((0.5 * averaged + weight * log_free) / (0.5 * temperature + weight))
+
+
+def pulled_by_squares(averaged: Array, mean: Array, temperature: float, weight: float) -> Array:
+    """Minimise ½(α log π - Q) + w ‖π - π_0‖² on average, given E[Q | x] and E[π_0 | x], all of shape (X, A).
+
+    Where the derivative vanishes, ½α log π + 2wπ = ½Q + 2w E π_0 + λ; λ is such that π sums to 1.
+    """
+    if weight == 0:
+        return softmax(averaged / temperature)
+    side = 0.5 * averaged + 2 * weight * mean
+
+    def policy(level: Array) -> Array:
+        exponent = 2 * (side + level[:, None]) / temperature + np.log(4 * weight / temperature)
+        solved: Array = temperature / (4 * weight) * wrightomega(exponent).real
+        return solved
+
+    low, high = np.full(len(side), -side.max() - 2 * weight - 50), np.full(len(side), -side.min() + 2 * weight + 50)
+    for _ in range(80):
+        level = (low + high) / 2
+        above = policy(level).sum(axis=1) > 1
+        low, high = np.where(above, low, level), np.where(above, level, high)
+    return policy((low + high) / 2)
+
+
 def adsac_fixed_point(
     mdp: MDP, delay: int, temperature: float, *, shorter: int = 0, data: Data = "delayed"
 ) -> ActorCritic:
@@ -133,7 +182,14 @@ def adsac_fixed_point(
 
 
 def actor_critic_fixed_point(
-    mdp: MDP, delay: int, temperature: float, *, shorter: int, data: Data, lower: bool
+    mdp: MDP,
+    delay: int,
+    temperature: float,
+    *,
+    shorter: int,
+    data: Data,
+    lower: bool,
+    improve: Callable[[Array, Array], Array] | None = None,
 ) -> ActorCritic:
     """Iterate critic, policy and data to their common fixed point.
 
@@ -149,6 +205,7 @@ def actor_critic_fixed_point(
         shorter: Auxiliary delay τ, in steps.
         data: Who acts, with π_τ for the reference.
         lower: Take for V the lower of both actors' values (`lower_value`), else that of π_Δ alone.
+        improve: How π_Δ follows from p(x^τ | x), (X, Z), and Q, (Z, A), if it is not soft-greedy.
 
     Raises:
         RuntimeError: No fixed point was found. The behaviour "lower_q" jumps where two Q-values cross, so that for some
@@ -173,7 +230,8 @@ def actor_critic_fixed_point(
             if lower:
                 values = lower_value(q[windows.shorter], values, temperature)
             q = reward + mdp.discount * reached @ (late * values).sum(axis=1)
-        updated = softmax(state_law_in_data(windows, acting, unmet) @ q / temperature)
+        law = state_law_in_data(windows, acting, unmet)
+        updated = improve(law, q) if improve else softmax(law @ q / temperature)
         if max(np.abs(q - before).max(), np.abs(updated - policy).max()) < 1e-11:
             return ActorCritic(q, updated)
         policy = policy + (updated - policy) * (0.5 if attempt < 100 else 0.05)  # undamped, data and policy can cycle

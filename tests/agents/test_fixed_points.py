@@ -32,6 +32,7 @@ from chain import (
 )
 
 from delayrl.agents.adsac import ADSAC
+from delayrl.agents.any_age import AnyAge
 from delayrl.agents.dida import DIDA
 from delayrl.agents.sac import SAC
 from delayrl.agents.vdpo import VDPO
@@ -257,6 +258,28 @@ def test_critics_take_one_step_from_the_target_critics(name: str) -> None:
     soft = np.asarray([7.0, 9.0])[:, None] - TEMPERATURE * np.asarray(act(Policy(jnp.zeros(1), jnp.zeros(1)))[1])
     value = np.minimum(soft[0][:, None], soft[1]).mean() if name == "ad-sac" else soft[0].mean()
     np.testing.assert_allclose(q_table(own.critic), [reward(ACTIONS) + DISCOUNT * value] * 2, atol=0.5)
+
+
+# ---- any-age -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("weight", "distance"), [(0.0, "moments"), (1.0, "moments"), (1.0, "kl")])
+def test_any_age_ends_where_its_pull_leaves_it(weight: float, distance: Any) -> None:
+    """Without a pull at BPQL's policy. Gaussians cannot be the geometric mean, so that KL moves them too, but less."""
+    solution = solve(bpql_value, pull=(weight, distance))
+    narrower = (late(expected("bpql"))[1] - late(solution)[1]).max()
+    assert narrower == pytest.approx(0.0 if weight == 0 else {"moments": 0.364, "kl": 0.246}[distance], abs=0.01)
+    bpql = AGENTS["bpql"]
+    constant = {"pull_hold": 1.0, "pull_end": 1.0, "run_steps": 10**6, "second_age": "zero"}
+    agent = AnyAge(bpql, pull_weight=weight, pull=distance, **constant)
+    state = agent.init(Spec(STATES, 1, 1), jax.random.key(1))
+    for rate, updates in ((1e-2, 600), (1e-3, 300)):
+        agent = replace(agent, bpql=with_options(bpql, actor_learning_rate=rate, critic_learning_rate=rate))
+        state = run(agent.update, state, windows(1), updates)
+    np.testing.assert_allclose(q_table(state.critic), [solution.q[:, AT_ACTIONS]] * 2, atol=Q_MARGIN)
+    assert_gaussians(bpql.policy(state.actor, histories()), *late(solution))
+    fresh = jnp.concatenate([jnp.eye(STATES), jnp.zeros((STATES, 2))], -1)  # x_t of age 0
+    assert_gaussians(bpql.policy(state.actor, fresh), solution.current.mean, np.exp(solution.current.log_std))
 
 
 # ---- Imitation ---------------------------------------------------------------------------------------------

@@ -9,9 +9,12 @@ import pytest
 from fixed_points import (
     Data,
     adsac_fixed_point,
+    any_age_fixed_point,
     bpql_fixed_point,
     imitation_fixed_point,
     lower_value,
+    pulled_by_kl,
+    pulled_by_squares,
     shorter_histories,
 )
 from gaussians import moment_match
@@ -128,6 +131,68 @@ def test_ad_sac_is_a_more_cautious_bpql(seed: int) -> None:
     assert (adsac.q < bpql.q - 0.02).all()
     assert (bpql.q < soft_optimal(mdp, temperature)[0] - 0.02).all()
     assert np.abs(adsac.policy - bpql.policy).max() < 0.02
+
+
+# ---- any-age: the pull of younger policies on older ones ---------------------------------------------------
+
+
+@seeds
+@pytest.mark.parametrize("younger", [0, 1, 2])
+def test_a_pull_by_kl_has_no_bias(seed: int, younger: int) -> None:
+    """Towards the soft-greedy policy of any younger view, with any weight: what it asks for is BPQL's policy itself."""
+    mdp, temperature = random_mdp(generator(seed), states=3, actions=2), 0.3
+    q, policy = bpql_fixed_point(mdp, 2, temperature)
+    belief = augment(mdp, 2).belief
+    shorter = softmax(augment(mdp, younger).belief @ q / temperature)
+    log_younger = shorter_histories(mdp, 2, younger) @ np.log(shorter)
+    for weight in (0.1, 1.0, 10.0):
+        found = pulled_by_kl(belief @ q, log_younger, temperature, weight)
+        np.testing.assert_allclose(found, policy, atol=1e-9)
+        rng, objective = generator(7), any_age_objective(belief @ q, temperature, weight)
+        for _ in range(20):  # and it is the minimum
+            other = rng.dirichlet(np.ones(2), size=len(policy))
+            own, others = (objective(p) - weight * (p * log_younger).sum(1) for p in (found, other))
+            assert (own <= others + 1e-12).all()
+
+
+def any_age_objective(averaged: np.ndarray, temperature: float, weight: float):
+    """½ E[α log π - Q] + w Σ π log π, to which the pull adds -w Σ π E[log π_j]."""
+    return lambda p: ((0.5 * temperature + weight) * p * np.log(p) - 0.5 * p * averaged).sum(1)
+
+
+@seeds
+def test_a_pull_by_squares_is_a_bias_until_it_is_gone(seed: int) -> None:
+    """It asks for the mixture, more so with a larger weight; without a weight, or without noise, it is BPQL."""
+    mdp, temperature = random_mdp(generator(seed), states=3, actions=2), 0.3
+    bpql = bpql_fixed_point(mdp, 2, temperature)
+    gaps = []
+    for weight in (0.0, 0.1, 1.0, 10.0):
+        _, policy = any_age_fixed_point(mdp, 2, temperature, weight, "squares")
+        np.testing.assert_allclose(policy.sum(1), 1, atol=1e-9)
+        gaps.append(np.abs(policy - bpql.policy).max())
+    assert gaps[0] < 1e-9
+    assert gaps == sorted(gaps)
+    assert gaps[-1] > 0.02
+    kl_pull = any_age_fixed_point(mdp, 2, temperature, 10.0, "kl")
+    np.testing.assert_allclose(kl_pull.policy, bpql.policy, atol=1e-8)
+    certain = random_mdp(generator(seed), states=3, actions=2, deterministic=True)
+    free = bpql_fixed_point(certain, 2, temperature).policy
+    np.testing.assert_allclose(any_age_fixed_point(certain, 2, temperature, 10.0, "squares").policy, free, atol=1e-6)
+
+
+@seeds
+def test_the_pull_by_squares_is_at_its_minimum(seed: int) -> None:
+    """No other distribution has a lower objective than what the formula with Wright's omega gives."""
+    rng = generator(seed)
+    averaged, mean = rng.normal(size=(50, 4)), rng.dirichlet(np.ones(4), size=50)
+
+    def objective(p: np.ndarray) -> np.ndarray:
+        return 0.5 * (0.3 * (p * np.log(p)).sum(1) - (p * averaged).sum(1)) + 2.0 * ((p - mean) ** 2).sum(1)
+
+    found = pulled_by_squares(averaged, mean, 0.3, 2.0)
+    for spread in (1e-3, 0.1, 1.0):
+        other = (1 - spread) * found + spread * rng.dirichlet(np.ones(4), size=50)
+        assert (objective(found) < objective(other)).all()
 
 
 @seeds
