@@ -57,12 +57,24 @@ class Learnable(NamedTuple):
 ALL = Learnable()
 
 
-def append(replay: Replay, step: Transition, learnable: Learnable = ALL) -> Replay:
-    """Store one step in its row, and the next observation in the next row, which the following step completes."""
+def current_moment(replay: Replay) -> Int[Array, ""]:
+    """Return how many steps the current episode has."""
+    return replay.moment[replay.rows % replay.moment.shape[0]]
+
+
+def append(
+    replay: Replay, step: Transition, learnable: Learnable = ALL, moment: Int[Array, ""] | None = None
+) -> Replay:
+    """Store one step in its row, and the next observation in the next row, which the following step completes.
+
+    `moment` is the `current_moment`, where a program of its own has read it.
+    """
     capacity = replay.obs.shape[0]
     here, after = replay.rows % capacity, (replay.rows + 1) % capacity
     rows = replay.rows + 1 + step.done.astype(jnp.int32)  # a finished episode keeps the row of its last observation
-    moment = jax.lax.optimization_barrier(replay.moment[here] + 1)  # read before the write, or XLA copies the array
+    if moment is None:
+        moment = jax.lax.optimization_barrier(current_moment(replay))  # read before the write, or XLA copies the array
+    moment += 1
     row_of = replay.row_of.at[replay.steps % capacity].set(replay.rows - (learnable.until_end - 1))
     counts = moment >= learnable.first + learnable.until_end
     if not learnable.time_limit:

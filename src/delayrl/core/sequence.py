@@ -2,12 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from delayrl.core.networks import Params, mlp, mlp_init
 from delayrl.core.transformer import transformer, transformer_init
 from delayrl.core.types import Key, Spec
-from delayrl.core.views import split_input
 
 
 def sequence_init(key: Key, spec: Spec, width: int, layers: int, hidden: tuple[int, ...], outputs: int) -> Params:
@@ -39,6 +38,10 @@ def tokens(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*ba
     return transformer(params["encoder"], obs, actions)
 
 
-def _parts(params: Params, x: Array) -> tuple[Array, Array, Array]:
-    """Return observation, actions and age of x_t; the encoder's shapes tell the longest age."""
-    return split_input(x, len(params["encoder"]["position"]), len(params["encoder"]["action"]["w"]))
+def _parts(
+    params: Params, x: Float[Array, "*batch input"]
+) -> tuple[Float[Array, "*batch obs"], Float[Array, "*batch delay action"], Int[Array, "*batch"]]:
+    """Return observation, actions and age of x_t (`network_input`); the encoder's shapes tell their sizes."""
+    delay, size = len(params["encoder"]["position"]), len(params["encoder"]["action"]["w"])
+    obs, actions, age = jnp.split(x, [x.shape[-1] - delay * size - 1, x.shape[-1] - 1], -1)
+    return obs, actions.reshape(*x.shape[:-1], delay, size), jnp.rint(age[..., 0] * delay).astype(jnp.int32)

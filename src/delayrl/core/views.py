@@ -50,14 +50,6 @@ def network_input(seen: Seen, sees: Sees) -> Float[Array, " input"]:
     return jnp.concatenate([seen.obs, seen.actions.reshape(-1), (seen.age / delay)[None]])
 
 
-def split_input(
-    x: Float[Array, "*batch input"], delay: int, action_size: int
-) -> tuple[Float[Array, "*batch obs"], Float[Array, "*batch delay action"], Int[Array, "*batch"]]:
-    """Return observation, actions and age of a `network_input` that sees x_t."""
-    obs, actions, age = jnp.split(x, [x.shape[-1] - delay * action_size - 1, x.shape[-1] - 1], -1)
-    return obs, actions.reshape(*x.shape[:-1], delay, action_size), jnp.rint(age[..., 0] * delay).astype(jnp.int32)
-
-
 def look(window: Window, sees: Sees, ahead: int | Int[Array, ""] = 0) -> Float[Array, " input"]:
     """Return the `network_input` at step t + `ahead` for a network that `sees` this view."""
     return network_input(view(window, ahead, 0 if sees == "current" else None), sees)

@@ -13,6 +13,9 @@ from delayrl.agents.base import Agent, State
 from delayrl.core import replay as ring
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Transition
 
+AS_ONE = jax.__version_info__ >= (0, 12)
+"""Whether XLA keeps the replay in place where one program writes and samples it; JAX 0.10 copies it at every step."""
+
 
 class Learner(NamedTuple):
     """What lives on the device, each with a leading seed axis."""
@@ -44,6 +47,10 @@ class Program:
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="first_phase", donate_argnums=0)
         self._jitted_update = jax.jit(self._update, static_argnames="index", donate_argnums=0)
+        self._jitted_moment = jax.jit(jax.vmap(ring.current_moment))
+        self._jitted_append = jax.jit(
+            jax.vmap(lambda replay, step, moment: self._append(replay, step, moment=moment)), donate_argnums=0
+        )
 
     def init(self, keys: Key, capacity: int) -> Learner:
         """Make fresh agents and empty replays."""
@@ -70,7 +77,8 @@ class Program:
         flat = [stored for seeds in pending for stored in seeds]
         shape = (len(steps), len(pending[0]))
         block = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *flat)
-        learner, metrics = self._jitted_learn(learner, block, keys, np.array(steps, np.int32), first_phase=first_phase)
+        learn = self._jitted_learn if AS_ONE else self._learn_apart
+        learner, metrics = learn(learner, block, keys, np.array(steps, np.int32), first_phase=first_phase)
         for step, phases in zip(steps, due, strict=True):
             for index in phases[1:] if first_phase else phases:
                 learner, more = self._jitted_update(learner, block.hidden[-1], keys, np.int32(step), index=index)
@@ -100,6 +108,20 @@ class Program:
             return learn_step(learner, jax.tree.map(lambda x: x[0], (block, steps)))
         learner, metrics = jax.lax.scan(learn_step, learner, (block, steps))
         return learner, jax.tree.map(lambda x: x.mean(0), metrics)
+
+    def _learn_apart(
+        self, learner: Learner, block: Stored, keys: Key, steps: NDArray[np.int32], first_phase: bool
+    ) -> tuple[Learner, Metrics]:
+        """Do what `_learn` does in calls of their own: the replay is written in one, and only read in the next."""
+        learned = []
+        for number, step in enumerate(steps):
+            transition, hidden = jax.tree.map(lambda x, number=number: x[number], block)
+            moment = self._jitted_moment(learner.replay)
+            learner = learner._replace(replay=self._jitted_append(learner.replay, transition, moment))
+            if first_phase:
+                learner, metrics = self._jitted_update(learner, hidden, keys, step, index=0)
+                learned.append(metrics)
+        return learner, jax.tree.map(lambda *x: sum(x) / len(x), *learned) if learned else {}
 
     def _update(
         self, learner: Learner, hidden: Hidden, keys: Key, step: Int[Array, ""], index: int
