@@ -3,6 +3,7 @@
 import pytest
 
 from delayrl.agents.registry import AGENTS
+from delayrl.run.condition import overrides_of, resolve
 from delayrl.run.configuration import values_of
 
 ANY_AGE = {
@@ -153,3 +154,25 @@ def test_matched_dcac() -> None:
 
 def test_matched_schedules() -> None:
     assert len({preset.schedule for preset in (entry.presets["matched"] for entry in AGENTS.values())}) == 1
+
+
+@pytest.mark.parametrize(
+    ("agent", "preset", "steps", "expected"),
+    [
+        ("lifting", "small", 100_000, {"lifting_hold": 25_000, "lifting_end": 75_000, "random_steps": 6_667}),
+        ("lifting", "small", 100_000, {"replay_capacity": 133_334, "evaluate_every": 16_667}),
+        ("lifting", "paper", 100_000, {"lifting_hold": 25_000, "lifting_end": 75_000, "random_steps": 10_000}),
+        ("lifting", "small", 1_500, {"lifting_hold": 375, "lifting_end": 1_125, "random_steps": 1_000}),
+        ("lifting", "small", 1_500, {"replay_capacity": 20_000, "evaluate_every": 2_500}),
+        ("dida", "matched", 300_000, {"expert_steps": 150_000, "random_steps": 5_000, "replay_capacity": 600_000}),
+        ("dida", "paper", 200_000, {"expert_steps": 100_000, "replay_capacity": 1_000_000, "evaluate_every": 10_000}),
+    ],
+)
+def test_presets_follow_the_length_of_the_run(agent: str, preset: str, steps: int, expected: dict[str, int]) -> None:
+    """Parts of a run always, what a longer one needs more of only there; and what follows is no override."""
+    setup = resolve(agent, "Reacher-v5", 3, preset, "corrected", {"steps": steps})
+    found = {**setup.config["hyperparameters"], **setup.config["schedule"]}
+    assert {name: found[name] for name in expected} == expected
+    assert overrides_of(setup.config) == {"steps": steps}
+    given = resolve(agent, "Reacher-v5", 3, preset, "corrected", {"steps": steps, "replay_capacity": 77_777})
+    assert given.config["schedule"]["replay_capacity"] == 77_777

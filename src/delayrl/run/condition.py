@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.normalised import NormalisedObservations
-from delayrl.agents.registry import find_agent
+from delayrl.agents.registry import Preset, find_agent
 from delayrl.core.protocol import Protocol, opening_length
 from delayrl.core.replay import Learnable
 from delayrl.core.types import Spec
@@ -18,6 +18,13 @@ from delayrl.errors import DelayRLError
 from delayrl.run.configuration import OLDER, check_names, override, values_of
 from delayrl.run.rows import CONDITION
 
+PARTS = ("lifting_hold", "lifting_end", "expert_steps")
+"""Options that are a part of the run, whatever its length."""
+GROWS: Mapping[str, Sequence[str]] = {
+    "matched": ("replay_capacity", "evaluate_every"),
+    "small": ("replay_capacity", "evaluate_every", "random_steps"),
+}
+"""Options of which a longer run than the preset's needs more."""
 KINDS = CONDITION | {"overrides": dict, "steps": int}
 
 
@@ -123,6 +130,7 @@ def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, 
     base, chosen = registration.presets[preset], registration.protocol(protocol)
     check_names(overrides, base.agent, base.schedule)
     values = {**chosen.overrides, **overrides}
+    values = following(preset, base, override(base.schedule, values).steps) | values
     schedule = override(base.schedule, values)
     parsed = delay_of(env, delay)
     text = parsed.plain()
@@ -139,6 +147,13 @@ def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, 
     return Setup(condition, made, schedule, parsed, chosen)
 
 
+def following(name: str, preset: Preset, steps: int) -> dict[str, int]:
+    """Return the options of the preset called `name` that are other numbers in a run of so many steps."""
+    usual, length = {**values_of(preset.agent), **values_of(preset.schedule)}, preset.schedule.steps
+    names = (*PARTS, *(GROWS.get(name, ()) if steps > length else ()))
+    return {name: -(-usual[name] * steps // length) for name in names if name in usual and steps != length}
+
+
 def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a run's configuration that differ from its preset's; none if we do not know the preset."""
     try:
@@ -146,7 +161,8 @@ def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
         preset, chosen = registration.presets[config["preset"]], registration.protocol(config["protocol"])
     except (KeyError, DelayRLError):
         return {}
-    usual = {k: v for part in preset for k, v in values_of(override(part, chosen.overrides)).items()}
+    habits = {**following(config["preset"], preset, config["schedule"]["steps"]), **chosen.overrides}
+    usual = {k: v for part in preset for k, v in values_of(override(part, habits)).items()}
     implied = {name: value for name, value in OLDER.items() if name in usual}
     options = {**implied, **config["hyperparameters"], **config["schedule"]}
     return {name: value for name, value in options.items() if name not in usual or usual[name] != value}
