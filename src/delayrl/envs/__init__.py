@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from delayrl.envs.making import delay_of as delay_of
     from delayrl.envs.making import make as make
     from delayrl.envs.making import physics as physics
-    from delayrl.envs.making import quiet as quiet
     from delayrl.envs.making import tasks as tasks
+    from delayrl.envs.task import quiet as quiet
 
-_MAKING = ("delay_of", "make", "physics", "quiet", "tasks")
+_HOME = {"delay_of": "making", "make": "making", "physics": "making", "tasks": "making", "quiet": "task"}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MAKING:
-        return getattr(import_module("delayrl.envs.making"), name)
+    if name in _HOME:
+        return getattr(import_module(f"delayrl.envs.{_HOME[name]}"), name)
     raise AttributeError(f"module 'delayrl.envs' has no attribute {name!r}")
