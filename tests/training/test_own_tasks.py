@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -159,3 +160,19 @@ def test_a_bundle_of_an_own_task(tmp_path: Path) -> None:
     policy, info = delayrl.load(run.path, make_arm), {"age": 1, "actions": np.full((3, 1), 0.5)}
     action = load_bundle(tmp_path / "bundle")(np.ones(1), info["actions"], 1)
     np.testing.assert_allclose(action, policy.act(np.ones(1), info), atol=1e-5)
+
+
+def test_the_page_on_own_tasks(tmp_path: Path, monkeypatch) -> None:
+    """Its Python runs as it stands: the first block is the module that the others import."""
+    page = (Path(__file__).parents[2] / "docs" / "own-task.md").read_text()
+    module, *blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(write_module(tmp_path, "arm", module))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(block.replace("steps=3000", "steps=1500, evaluate_every=750"), {})
+    assert {path.parent.parent.name for path in Path("runs").glob("*/*/*")} == {
+        "arm-make-gain=0.2-delay4",
+        "lambda-gain=0.2-delay4",
+    }
+    sys.modules.pop("arm")

@@ -94,7 +94,7 @@ def test_images_and_unbounded_actions() -> None:
         observation_space = gym.spaces.Box(-1, 1, (3,))
         action_space = gym.spaces.Box(-np.inf, np.inf, (1,))
 
-    with pytest.raises(delayrl.DelayRLError, match="images"):
+    with pytest.raises(delayrl.DelayRLError, match="flat vectors; got Box"):
         Delayed(Images(), 1)
     with pytest.raises(delayrl.DelayRLError, match="bounded"):
         Delayed(Unbounded(), 1)

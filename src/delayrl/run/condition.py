@@ -39,6 +39,11 @@ class Condition:
         return short_label(self.delay)
 
     @property
+    def place(self) -> str:
+        """The task and the delay as folders are named by them: without brackets at the ends, and not too long."""
+        return f"{self.env.strip('<>() ')[:100]}-delay{self.label}"
+
+    @property
     def columns(self) -> dict[str, Any]:
         """What every row says of its condition."""
         return {name: getattr(self, name) for name in CONDITION} | {"delay": self.label}

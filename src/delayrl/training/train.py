@@ -114,7 +114,7 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
     kind = f"{condition.agent}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"
-    task = re.sub(r"[^\w.=+@-]+", "-", f"{condition.env[:100]}-delay{condition.label}")
+    task = re.sub(r"[^\w.=+@-]+", "-", condition.place)
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
         return [Run(home)]
