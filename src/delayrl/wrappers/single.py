@@ -45,13 +45,13 @@ def seconds_of(env: Any) -> float | None:
     return None
 
 
-def is_delayed(env: Any) -> bool:
-    """Return whether an environment, or one of those that it wraps, is a `Delayed`."""
+def find_delayed(env: Any) -> "Delayed | None":
+    """Return the `Delayed` that an environment is or wraps, if any."""
     while isinstance(env, gym.Wrapper):
         if isinstance(env, Delayed):
-            return True
+            return env
         env = env.env
-    return False
+    return None
 
 
 def limit_of(env: Any) -> int | None:
@@ -137,7 +137,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
-        if is_delayed(env):
+        if find_delayed(env):
             raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
