@@ -12,8 +12,10 @@ from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.wrappers import TimeLimit
 
 import delayrl
+from delayrl.envs import delay_of
 from delayrl.envs.task import Part, Task, as_task, stored_task
 from delayrl.errors import DelayRLError
+from delayrl.run.condition import resolve
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
 
 
@@ -148,6 +150,14 @@ def test_the_limit_of_an_environment_without_a_spec() -> None:
         delayrl.make(Ends, 13, wrappers=[limited])
 
 
+def test_another_limit_than_the_registered_one() -> None:
+    """Gymnasium's own keyword argument: longer episodes allow longer delays, and shorter ones do not."""
+    assert delay_of("Pendulum-v1(max_episode_steps=300)", 250).maximum == 250
+    assert resolve("bpql", "Pendulum-v1(max_episode_steps=300)", 250, "small", "corrected", {}).delay.maximum == 250
+    with pytest.raises(DelayRLError, match=r"longer than an episode of Pendulum-v1 \(50 steps\)"):
+        delayrl.make("Pendulum-v1", 51, max_episode_steps=50)
+
+
 # ------------------------------------------------------------------------------------------------ errors
 
 
@@ -258,6 +268,11 @@ def test_code_that_came_with_a_run_folder_is_not_imported(name: str, tmp_path: P
             write_module(tmp_path / "runs", "__init__", text)
         with pytest.raises(DelayRLError):
             stored_task(f"{name}:Arm", folder)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "link").symlink_to(tmp_path / "runs")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    with pytest.raises(DelayRLError, match="could run any code"):
+        stored_task("link.evil:Arm", Path("link") / "mine")
     monkeypatch.chdir(folder)
     with pytest.raises(DelayRLError, match="could run any code"):
         stored_task("evil:Arm", Path())

@@ -90,7 +90,7 @@ def find_stored(name: str, folder: Path) -> Any:
     with one_line(f"cannot import {source!r}"):
         spec = importlib.util.find_spec(source.partition(".")[0])  # of the package: imports nothing
     places = [spec.origin or "", *(spec.submodule_search_locations or [])] if spec is not None else []
-    if any(Path(place).resolve().is_relative_to(_top(folder)) for place in places):
+    if any(Path(place).resolve().is_relative_to(top) for place in places for top in _tops(folder)):
         raise refusal
     found = find_object(name)
     if isinstance(found, str) or (isinstance(found, type) and issubclass(found, gym.Env)) or _is_own(found):
@@ -98,12 +98,12 @@ def find_stored(name: str, folder: Path) -> Any:
     raise refusal
 
 
-def _top(folder: Path) -> Path:
-    """Return the highest folder below the working folder that holds a run: what was downloaded is not above it."""
-    path, here = folder.resolve(), Path.cwd().resolve()
-    if not path.is_relative_to(here):
-        return path
-    return here.joinpath(*path.relative_to(here).parts[:1])
+def _tops(folder: Path) -> Iterator[Path]:
+    """Yield the highest folder below the working folder that holds a run: what was downloaded is not above it."""
+    here = Path.cwd().resolve()
+    for path in (Path(os.path.abspath(folder)), folder.resolve()):  # they differ if one of the folders is a link
+        top = here.joinpath(*path.relative_to(here).parts[:1]) if path.is_relative_to(here) else path
+        yield top.resolve()
 
 
 def _is_own(thing: Any) -> bool:

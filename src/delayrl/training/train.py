@@ -132,7 +132,7 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
     if limit_of(env) is None:
-        hint = "--wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)' gives it one"
+        hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'"
         raise DelayRLError(f"{setup.task} has no time limit, so evaluation may never end; {hint}")
     return template(agent, spec)
 

@@ -23,7 +23,7 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
     """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
     if not isinstance(observations, Box) or len(observations.shape) != 1:
         got = " ".join(str(observations).split())[:200]
-        hint = "flatten=True (--flatten) joins numbers of a Dict or an image to one"
+        hint = "flatten=True (--flatten) turns a Dict or an image into one"
         raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}: {hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
         raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
