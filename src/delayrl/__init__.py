@@ -2,10 +2,13 @@
 
 `make` wraps a Gymnasium task with a delay, `train` trains an agent on it, `load` gives back the policy of a
 run. JAX is imported only when training or a policy is asked for: `delayrl.wrappers` needs NumPy and Gymnasium alone.
+Importing delayrl registers its tasks: `gymnasium.make("delayrl/Ant-v4")`.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from delayrl.envs.registration import watch_gymnasium
 
 if TYPE_CHECKING:
     from delayrl.agents.registry import AGENTS as AGENTS
@@ -38,6 +41,8 @@ _HOME = {
     "train": "training.train",
 }
 __all__ = sorted(_HOME)
+
+watch_gymnasium()
 
 
 def __getattr__(name: str) -> Any:

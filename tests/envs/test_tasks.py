@@ -7,6 +7,7 @@ import pytest
 import delayrl
 from delayrl import envs
 from delayrl.delays import as_delay
+from delayrl.envs import making
 
 
 def test_times_in_seconds() -> None:
@@ -23,8 +24,8 @@ def test_a_task_is_made_only_for_the_length_of_its_steps(monkeypatch: pytest.Mon
         made.append(name)
         return gym_make(name, **options)
 
-    gym_make = envs.gym.make
-    monkeypatch.setattr(envs.gym, "make", make)
+    gym_make = making.gym.make
+    monkeypatch.setattr(making.gym, "make", make)
     for delay in (5, "uniform:1:5", as_delay("walk:3"), "recorded:1,2,"):
         assert envs.delay_of("Pendulum-v1", delay) == as_delay(delay)
     assert not made

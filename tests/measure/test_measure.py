@@ -274,7 +274,7 @@ def test_environments_that_cannot_be_probed() -> None:
         probe(make("CartPole-v1"))
     with pytest.raises(DelayRLError, match="must return a Gymnasium environment; got int"):
         probe(lambda: 3)
-    with pytest.raises(DelayRLError, match="failed: ZeroDivisionError"):
+    with pytest.raises(DelayRLError, match="cannot be made here: ZeroDivisionError"):
         probe(lambda: 1 / 0)
 
 
@@ -514,7 +514,7 @@ def test_command_for_environments(tmp_path: Path, monkeypatch, capsys: pytest.Ca
     assert (result["kind"], result["total"], result["maximum"]) == ("environment", {"2": 64}, 2)
     (tmp_path / "my_broken_task.py").write_text("def make_env(:\n")
     for target, words in (
-        ("my_own_task:nothing", "has no function 'nothing'"),
+        ("my_own_task:nothing", "has no class or function 'nothing'"),
         ("nowhere_at_all:make", "cannot import"),
         ("my_broken_task:make_env", "cannot import"),
         ("Pendulm-v1", "did you mean Pendulum-v1"),

@@ -7,6 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import (
+    FrameStackObservation,
+    NormalizeObservation,
+    RescaleAction,
+    TimeLimit,
+    TransformObservation,
+)
 
 import delayrl
 from delayrl.errors import DelayWarning
@@ -64,6 +71,46 @@ def test_augmented_is_flat() -> None:
         assert env.observation_space.contains(x)
 
 
+def test_augmented_over_other_wrappers() -> None:
+    """The outer wrappers' observation, the actions in the delay's own units, the age; the checker finds no fault."""
+    plain = rescaled_actions(delayrl.make("Pusher-v5", 4))
+    halved = TransformObservation(rescaled_actions(delayrl.make("Pusher-v5", 4)), lambda obs: obs / 2, None)
+    env = AugmentedObservation(TimeLimit(halved, 8))
+    seen, infos, _ = rollout(plain, 20)
+    flat, _, _ = rollout(env, 20)
+    assert len(flat) == 9
+    for obs, info, x in zip(seen, infos, flat, strict=False):
+        np.testing.assert_allclose(x, np.concatenate([obs / 2, info["actions"].ravel(), [info["age"] / 4]]))
+        assert env.observation_space.contains(x)
+    assert max(abs(x[23:-1]).max() for x in flat) > 1  # Pusher's range is ±2, the agent's is ±1
+
+
+def rescaled_actions(env: gym.Env) -> gym.Env:
+    return RescaleAction(env, np.float32(-1), np.float32(1))
+
+
+def test_augmented_and_normalised() -> None:
+    """The first S numbers are what NormalizeObservation shows without us, number for number."""
+    env = AugmentedObservation(NormalizeObservation(Delayed(gym.make("Pendulum-v1"), 3)))
+    without = NormalizeObservation(Delayed(gym.make("Pendulum-v1"), 3))
+    for ours, theirs in zip(rollout(env, 20)[0], rollout(without, 20)[0], strict=True):
+        np.testing.assert_array_equal(ours[:3], theirs)
+        assert env.observation_space.contains(ours)
+    made_again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert made_again.observation_space == env.observation_space
+
+
+def test_what_cannot_be_augmented() -> None:
+    once = AugmentedObservation(delayrl.make("Pendulum-v1", 2))
+    for env, words in (
+        (TimeLimit(gym.make("Pendulum-v1"), 3), "wrap the task in Delayed first"),
+        (TimeLimit(once, 3), "augmented already"),
+        (FrameStackObservation(delayrl.make("Pendulum-v1", 2), 2), "flat vectors; got Box"),
+    ):
+        with pytest.raises(delayrl.DelayRLError, match=words):
+            AugmentedObservation(env)
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("augmented", [False, True])
 def test_gymnasium_checker(augmented: bool) -> None:
@@ -94,7 +141,7 @@ def test_images_and_unbounded_actions() -> None:
         observation_space = gym.spaces.Box(-1, 1, (3,))
         action_space = gym.spaces.Box(-np.inf, np.inf, (1,))
 
-    with pytest.raises(delayrl.DelayRLError, match="images"):
+    with pytest.raises(delayrl.DelayRLError, match="flat vectors; got Box"):
         Delayed(Images(), 1)
     with pytest.raises(delayrl.DelayRLError, match="bounded"):
         Delayed(Unbounded(), 1)

@@ -17,6 +17,7 @@ from typing import Any
 
 from delayrl.agents.registry import find_agent
 from delayrl.envs import make
+from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.run.cell import Cell
@@ -24,7 +25,8 @@ from delayrl.run.condition import Setup, resolve
 from delayrl.training.train import check_fit
 
 LISTS = {"agents": list, "tasks": list, "delays": list}
-PRODUCT = {**LISTS, "seeds": int | list, "lockstep": int, "preset": str, "protocol": str, "overrides": dict}
+TASK = {"env_kwargs": dict, "wrappers": list, "flatten": bool}
+PRODUCT = {**LISTS, **TASK, "seeds": int | list, "lockstep": int, "preset": str, "protocol": str, "overrides": dict}
 GRID = {**PRODUCT, "name": str, "description": str, "include": list, "product": list}
 DEFAULTS: dict[str, Any] = {"preset": "paper", "protocol": "corrected", "seeds": 1, "overrides": {}}
 
@@ -121,8 +123,8 @@ def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], what: str) -
     for key, value in table.items():
         if key not in known:
             raise DelayRLError(f"unknown key {key!r} of {what}; allowed are {', '.join(known)}")
-        if not isinstance(value, known[key]) or isinstance(value, bool):
-            words = {list: "a list", dict: "a table", str: "a string", int: "a whole number"}
+        if not isinstance(value, known[key]) or (isinstance(value, bool) and known[key] is not bool):
+            words = {list: "a list", dict: "a table", str: "a string", int: "a whole number", bool: "true or false"}
             raise DelayRLError(f"{key} must be {words.get(known[key], 'a number or a list')}; got {value!r}")
 
 
@@ -149,7 +151,9 @@ def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
         find_agent(agent)
     shared = {name: value for name, value in table["overrides"].items() if not isinstance(value, dict)}
     groups = _seed_groups(table["seeds"], table.get("lockstep"))
-    for env, delay, agent in product(table["tasks"], table["delays"], table["agents"]):
+    around = table.get("env_kwargs"), table.get("wrappers", ()), table.get("flatten", False)
+    tasks = [str(as_task(env, *around)) for env in table["tasks"]]
+    for env, delay, agent in product(tasks, table["delays"], table["agents"]):
         overrides = json.dumps(shared | table["overrides"].get(agent, {}), default=str)
         try:
             setup = _setup(agent, env, delay, table["preset"], table["protocol"], overrides)

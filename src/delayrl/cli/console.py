@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +28,36 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise DelayRLError instead of printing the usage."""
         raise DelayRLError(f"{message.replace('argument ', '')} (see `{self.prog} --help`)")
+
+
+def add_env_kwargs(parser: argparse._ActionsContainer) -> None:
+    """Add `--env-kwargs`, which gives pairs of a name and a value."""
+    words = "keyword arguments of the environment; values are JSON, else text"
+    parser.add_argument("--env-kwargs", nargs="+", action="extend", type=pair, default=[], metavar="NAME=V", help=words)
+
+
+def add_wrappers(parser: argparse._ActionsContainer) -> None:
+    """Add `--wrapper` and `--flatten`."""
+    words = "put this wrapper around the environment; may be repeated, innermost first"
+    parser.add_argument("--wrapper", action="append", dest="wrappers", default=[], metavar="MODULE:CLASS", help=words)
+    parser.add_argument("--flatten", action="store_true", help="join nested observations to one vector")
+
+
+def add_stored_env(parser: argparse.ArgumentParser) -> None:
+    """Add `--env`, for runs whose folder does not say enough to make their environment."""
+    words = "what makes the environment (default: what the run names)"
+    parser.add_argument("--env", metavar="MODULE:NAME", help=words)
+
+
+def pair(word: str) -> tuple[str, Any]:
+    """Return name and value of a word such as `gain=2`. Raises DelayRLError if it is none."""
+    name, equals, text = word.partition("=")
+    if not name.isidentifier() or not equals:
+        raise DelayRLError(f"keyword arguments are written NAME=VALUE, e.g. gain=2; got {word!r}")
+    try:
+        return name, json.loads(text)
+    except ValueError:
+        return name, text
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

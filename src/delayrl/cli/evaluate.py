@@ -4,8 +4,9 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
-from delayrl.cli.console import print_table
+from delayrl.cli.console import add_env_kwargs, add_stored_env, print_table
 from delayrl.errors import DelayRLError
 
 
@@ -18,16 +19,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--sweep", action="store_true", help="play every delay from 0 to the longest, and draw a figure")
     add("--seed", type=int, default=0, help="seed of the start states (default: 0)")
     add("--json", action="store_true", help="print JSON")
+    add_stored_env(parser)
+    add_env_kwargs(parser)
 
 
 def run(given: argparse.Namespace) -> None:
     """Play the episodes, and print their returns."""
     from delayrl.play.evaluation import evaluate
 
+    task = {"env": given.env, "env_kwargs": dict(given.env_kwargs)}
     if given.sweep:
-        _sweep(given)
+        _sweep(given, task)
         return
-    result = evaluate(given.run, given.episodes, given.delay, given.seed)
+    result = evaluate(given.run, given.episodes, given.delay, given.seed, **task)
     if given.json:
         print(json.dumps(result))
         return
@@ -35,7 +39,7 @@ def run(given: argparse.Namespace) -> None:
     print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}")
 
 
-def _sweep(given: argparse.Namespace) -> None:
+def _sweep(given: argparse.Namespace, task: dict[str, Any]) -> None:
     from tqdm import tqdm
 
     from delayrl.play.evaluation import sweep
@@ -44,8 +48,9 @@ def _sweep(given: argparse.Namespace) -> None:
 
     if given.delay is not None:
         raise DelayRLError("--sweep plays every delay; leave --delay out")
-    delays = load(given.run).spec.delay + 1
-    results = list(tqdm(sweep(given.run, given.episodes, given.seed), total=delays, unit="delay", disable=given.json))
+    delays = load(given.run, **task).spec.delay + 1
+    played = sweep(given.run, given.episodes, given.seed, **task)
+    results = list(tqdm(played, total=delays, unit="delay", disable=given.json))
     if given.json:
         print(json.dumps(results))
     else:

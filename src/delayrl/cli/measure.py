@@ -1,21 +1,20 @@
 """`delayrl measure ENV|LOG`: the options and the printed result."""
 
 import argparse
-import importlib
 import json
 import re
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from delayrl.errors import DelayRLError, first_line
+from delayrl.cli.console import add_env_kwargs, add_wrappers
+from delayrl.envs.task import as_task
+from delayrl.errors import DelayRLError
 from delayrl.measure.log import Estimated, from_log, plot
 from delayrl.measure.probing import Counts, Probed, probe
-from delayrl.measure.pushes import Env
 from delayrl.measure.reading import UNITS
 
 COLUMNS = ("time", "commands", "observations", "episode", "stamp", "received")
@@ -24,11 +23,18 @@ COLUMNS = ("time", "commands", "observations", "episode", "stamp", "received")
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `delayrl measure`."""
     add = parser.add_argument
-    add("target", metavar="ENV|LOG", help="a Gymnasium task, module:function that makes one, or a CSV or Parquet file")
+    add(
+        "target",
+        metavar="ENV|LOG",
+        help="a Gymnasium task, or module:function that makes one; or a CSV or Parquet file",
+    )
     add("--json", action="store_true", help="print one JSON object")
     add("--seed", type=int, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
     add("--longest", metavar="N|TIME", help="the longest delay to look for: steps (200), or time (100 rows of the log)")
-    parser.add_argument_group("environment").add_argument("--episodes", type=int, help="episodes to play (default: 8)")
+    environment = parser.add_argument_group("environment")
+    environment.add_argument("--episodes", type=int, help="episodes to play (default: 8)")
+    add_env_kwargs(environment)
+    add_wrappers(environment)
     add = parser.add_argument_group("log").add_argument
     add("--period", metavar="TIME", help="control period, e.g. 20ms or 50Hz (default: the spacing of the rows)")
     add("--time", metavar="NAME", help="column of the time stamps (default: time, timestamp or t)")
@@ -47,7 +53,7 @@ def run(given: argparse.Namespace) -> None:
     """Measure the delay and print it."""
     path = Path(given.target)
     if path.is_file() or path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
-        _refuse(given, ("episodes",), "an environment", "a log")
+        _refuse(given, ("episodes", "env_kwargs", "wrappers", "flatten"), "an environment", "a log")
         columns = {name: getattr(given, name) for name in COLUMNS}
         times: dict[str, Any] = {name: seconds(name, getattr(given, name)) for name in ("period", "longest", "warm_up")}
         result = from_log(given.target, **columns, **times, unit=given.unit or "s", seed=given.seed)
@@ -63,28 +69,9 @@ def run(given: argparse.Namespace) -> None:
         raise DelayRLError(f"--longest counts steps of an environment; got {longest!r}")
     episodes = 8 if given.episodes is None else given.episodes
     bar = partial(tqdm, desc="pushing", unit="episode", leave=False, disable=None)  # None: only on a terminal
-    probed = probe(find_task(given.target), episodes, given.seed, int(longest), bar)
+    task = as_task(given.target, dict(given.env_kwargs), given.wrappers, given.flatten)
+    probed = probe(task, episodes, given.seed, int(longest), bar)
     print(json.dumps(probed.json()) if given.json else _show_environment(probed))
-
-
-def find_task(target: str) -> str | Callable[[], Env]:
-    """Import the function that `module:function` names; return any other text as it is, the id of a task."""
-    name, _, attribute = target.partition(":")
-    if not attribute or not re.fullmatch(r"[\w.]+", name):
-        return target
-    sys.path.insert(0, "")  # also look in the working folder, as `python -m` does
-    try:
-        module = importlib.import_module(name)
-    except Exception as error:  # a module may raise anything
-        raise DelayRLError(f"cannot import {name!r}: {first_line(error)}") from error
-    finally:
-        sys.path.remove("")
-    function = getattr(module, attribute, None)
-    if not callable(function):
-        if function is None and "-v" in attribute:
-            return target  # Gymnasium's own form, module:ID
-        raise DelayRLError(f"module {name!r} has no function {attribute!r}")
-    return function
 
 
 def seconds(name: str, text: str | None) -> float | None:
@@ -207,5 +194,6 @@ def _plural(count: int, word: str) -> str:
 def _refuse(given: argparse.Namespace, names: tuple[str, ...], of: str, target: str) -> None:
     """Raise DelayRLError if an option was given that the target does not have."""
     for name in names:
-        if getattr(given, name) is not None:
-            raise DelayRLError(f"--{name.replace('_', '-')} is an option of {of}; {given.target} is taken for {target}")
+        if getattr(given, name) not in (None, [], False):
+            option = "wrapper" if name == "wrappers" else name.replace("_", "-")
+            raise DelayRLError(f"--{option} is an option of {of}; {given.target} is taken for {target}")

@@ -15,4 +15,4 @@ def run(given: argparse.Namespace) -> None:
         sizes = [env.observation_space.shape[0], actions.shape[0], f"±{actions.high.max():g}"]
         rows.append([name, *sizes, env.spec.max_episode_steps or "-", f"{seconds:g}" if seconds else "-"])
     print_table(["task", "observation", "action", "range", "time limit", "seconds a step"], rows)
-    print("\nAny other Gymnasium task with flat Box observations and bounded Box actions works as well.")
+    print("\nAny other Gymnasium task with bounded Box actions works as well, and so does MODULE:NAME of your own.")

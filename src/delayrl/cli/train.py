@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from delayrl.cli import agents
-from delayrl.cli.console import Parser
+from delayrl.cli.console import Parser, add_env_kwargs, add_wrappers
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import Run
 
@@ -30,7 +30,9 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
 
     add = parser.add_argument
     add("agent", help=argparse.SUPPRESS)
-    add("--env", required=True, metavar="ID", help="a Gymnasium task; `delayrl tasks` lists some")
+    add("--env", required=True, metavar="ID", help="a Gymnasium task (`delayrl tasks` lists some), or MODULE:NAME")
+    add_env_kwargs(parser)
+    add_wrappers(parser)
     add("--delay", default="0", metavar="DELAY", help="steps, or e.g. 80ms, uniform:1:5 (default: 0)")
     add("--preset", choices=list(agent.presets), default="paper", help="the defaults of the options (default: paper)")
     add("--seed", type=int, default=0, metavar="K", help="fixes everything (default: 0)")
@@ -67,7 +69,7 @@ def run(given: argparse.Namespace) -> None:
     """Train, and print the results of each run."""
     from delayrl.training.train import train
 
-    values = vars(given)
+    values = vars(given) | {"env_kwargs": dict(given.env_kwargs)}
     runs = train(progress=not values.pop("quiet"), **values)
     for result in runs if isinstance(runs, list) else [runs]:
         _print_summary(result)

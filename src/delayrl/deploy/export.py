@@ -9,21 +9,23 @@ import safetensors.numpy
 from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.backends.onnx_policy import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
-from delayrl.envs import make, seconds_of
-from delayrl.play.policy import Policy, restored
+from delayrl.envs.making import make, seconds_of
+from delayrl.envs.task import Task, TaskLike
+from delayrl.play.policy import Policy, restored, task_of
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.run.rows import check_row
 
 
-def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict[str, Any]:
+def export_run(run: str | Path, out: str | Path, *, force: bool = False, env: TaskLike | None = None) -> dict[str, Any]:
     """Write the policy in the newest good checkpoint of a run folder as a bundle; return its metadata.
 
     Args:
         run: the run folder.
         out: a new or empty folder.
         force: replace a bundle in `out`.
+        env: what makes the run's environment, as `delayrl.load`.
 
     Raises:
         DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
@@ -31,8 +33,9 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False) -> dict
     check_target(Path(out), force=force)
     source = Run(Path(run))
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
-    policy = restored(config, checkpoint)
-    metadata = describe(source, checkpoint.step, policy.spec.delay)
+    task = task_of(run, env)
+    policy = restored(config, checkpoint, task)
+    metadata = describe(source, checkpoint.step, policy.spec.delay, task)
     write_files(Path(out), bundle_files(policy, metadata), force=force)
     return metadata
 
@@ -75,10 +78,10 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     return network, arrays
 
 
-def describe(run: Run, step: int, longest: int) -> dict[str, Any]:
+def describe(run: Run, step: int, longest: int, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
     config = run.config
-    env = make(config["env"], config["delay"])
+    env = make(task, config["delay"])
     env.close()
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {

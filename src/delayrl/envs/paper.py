@@ -2,10 +2,7 @@
 
 The papers use Gymnasium's `-v4` tasks on MuJoCo 2. On MuJoCo 3 the same ids are other tasks, because the simulator
 changed. This module makes Gymnasium's own environments, and `MuJoCo2` undoes those changes. `docs/tasks.md` says how
-closely the result agrees with MuJoCo 2.3.7.
-
-    delayrl.envs.paper.register()
-    env = gymnasium.make("delayrl/Ant-v4")
+closely the result agrees with MuJoCo 2.3.7. `registration` gives the tasks their ids, `delayrl/Ant-v4` and so on.
 """
 
 import hashlib
@@ -16,11 +13,11 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
+from delayrl.envs.registration import NOISE as NOISE
+from delayrl.envs.registration import TASKS as TASKS
+from delayrl.envs.registration import register as register
 from delayrl.errors import DelayRLError
-from delayrl.wrappers import NoisyActions
 
-TASKS = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Pusher", "Reacher", "Swimmer", "Walker2d")
-NOISE = 0.1  # probability of a random action in the noisy tasks (AD-SAC, ICML 2024)
 OLDEST, MARGINS_SUMMED, TOO_NEW = (3, 2, 7), (3, 5, 0), (4, 0, 0)  # MuJoCo versions
 
 # The parts of the model that a fingerprint reads. It leaves out positions and orientations, because the axes of a round
@@ -34,34 +31,6 @@ body_mass body_inertia body_invweight0 dof_invweight0 dof_armature dof_damping j
 jnt_range jnt_margin jnt_solref jnt_solimp geom_type geom_size geom_contype geom_conaffinity geom_condim
 geom_margin geom_gap geom_friction geom_solref geom_solimp actuator_gear actuator_ctrlrange
 """
-
-
-def register() -> None:
-    """Add the tasks and their noisy variants to Gymnasium's registry. Does not load MuJoCo; may be called again.
-
-    The ids are `delayrl/Ant-v4` … `delayrl/Walker2d-v4`, and `delayrl/NoisyAnt-v4` … for the tasks of AD-SAC's paper in
-    which a tenth of the actions is random.
-
-    Entry point, time limit and reward threshold are Gymnasium's own. Its `Pusher-v4` refuses MuJoCo 3, so our Pusher is
-    `Pusher-v5` with v4's model file and v4's reward timing.
-    """
-    for task in TASKS:
-        if f"delayrl/{task}-v4" in gymnasium.registry:
-            continue
-        pusher = task == "Pusher"
-        origin = gymnasium.registry["Pusher-v5" if pusher else f"{task}-v4"]
-        wrappers: list[Any] = [MuJoCo2, RewardBeforeStep] if pusher else [MuJoCo2]
-        physics = tuple(wrapper.wrapper_spec() for wrapper in wrappers)
-        noise = NoisyActions.wrapper_spec(probability=NOISE)
-        for name, additional in ((task, physics), (f"Noisy{task}", (*physics, noise))):
-            gymnasium.register(
-                id=f"delayrl/{name}-v4",
-                entry_point=origin.entry_point,
-                max_episode_steps=origin.max_episode_steps,
-                reward_threshold=origin.reward_threshold,
-                kwargs={"xml_file": "pusher.xml"} if pusher else {},
-                additional_wrappers=additional,
-            )
 
 
 class MuJoCo2(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

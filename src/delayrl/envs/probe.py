@@ -70,10 +70,3 @@ class Counter(gym.Env[Obs, Obs]):
 
     def _obs(self) -> Obs:
         return np.array([self._time, self._length], np.float32)
-
-
-def register() -> None:
-    """Add the probes to Gymnasium's registry. May be called again."""
-    for name, entry, limit in (("Coin", Coin, 50), ("Walk", Walk, 50), ("Counter", Counter, 1000)):
-        if f"delayrl/{name}-v0" not in gym.registry:
-            gym.register(f"delayrl/{name}-v0", entry_point=entry, max_episode_steps=limit)  # type: ignore[arg-type]

@@ -20,7 +20,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from delayrl.errors import DelayRLError, first_line
+from delayrl.envs.task import TaskLike, as_task
+from delayrl.errors import DelayRLError, described
 from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push
 
 Counts = dict[int, int]  # {steps of delay: how often}
@@ -60,7 +61,7 @@ class Probed:
 
 
 def probe(
-    env: str | Env | Callable[[], Env],
+    env: TaskLike | Env,
     episodes: int = 8,
     seed: int = 0,
     longest: int = 200,
@@ -69,25 +70,26 @@ def probe(
     """Measure the delay of an environment.
 
     Args:
-        env: an id of Gymnasium's registry, an environment, or a function without arguments that makes one. Its actions
-            must be a `Box`; observations may be any space that Gymnasium can flatten.
+        env: an environment, or what makes one: an id of Gymnasium's registry, `module:object`, a class or function.
+            Its actions must be a `Box`; observations may be any space that Gymnasium can flatten.
         episodes: how many to play, from the seeds `seed`, `seed + 1`, …
         seed: of the first episode.
         longest: the longest delay to look for, in steps.
         wrap: wraps the episodes, for example in a progress bar.
 
     Raises:
-        DelayRLError: the actions are not a `Box`, the environment does not repeat itself, or no observation reacts.
+        DelayRLError: no such task, the actions are not a `Box`, the environment does not repeat itself, or no
+            observation reacts.
     """
     if episodes < 1 or longest < 1:
         raise DelayRLError(f"episodes and longest count from 1; got {episodes} and {longest}")
-    task = _make(env)
+    task = env if isinstance(env, gym.Env) else as_task(env).make()
     try:
         return _probe(task, episodes, seed, longest, wrap)
     except DelayRLError:
         raise
     except Exception as error:  # an environment may raise anything
-        raise DelayRLError(f"{task} failed while it was played: {_described(error)}") from error
+        raise DelayRLError(f"{task} failed while it was played: {described(error)}") from error
     finally:
         if task is not env:
             task.close()
@@ -223,24 +225,3 @@ def _count_ages(ages: list[Array], oldest: int) -> Counts:
 
 def _count(steps: Iterable[int]) -> Counts:
     return dict(sorted(Counter(steps).items()))
-
-
-def _make(env: str | Env | Callable[[], Env]) -> Env:
-    if isinstance(env, gym.Env):
-        return env
-    if isinstance(env, str):
-        from delayrl.envs import make
-
-        return make(env).env
-    name = getattr(env, "__name__", env)
-    try:
-        made = env()
-    except Exception as error:
-        raise DelayRLError(f"{name}() failed: {_described(error)}") from error
-    if not isinstance(made, gym.Env):
-        raise DelayRLError(f"{name}() must return a Gymnasium environment; got {type(made).__name__}")
-    return made
-
-
-def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {first_line(error)}"

@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +17,9 @@ from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
+from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayRLError
-from delayrl.play.policy import Policy, load
+from delayrl.play.policy import Policy, load, task_of
 from delayrl.run.folder import Run
 
 
@@ -40,7 +41,7 @@ class Evaluator:
         self,
         agent: Agent,
         spec: Spec,
-        env: str,
+        env: TaskLike,
         delay: int | str | Delay,
         seeds: int,
         episodes: int,
@@ -97,7 +98,7 @@ class Evaluator:
         return seen_now(obs, info, self._delay, privileged=False)
 
 
-def servable(env: str, delay: int | str | Delay, spec: Spec) -> Delay:
+def servable(env: TaskLike, delay: int | str | Delay, spec: Spec) -> Delay:
     """Return the delay without that of rewards. Raises DelayRLError if it is longer than a policy was trained for."""
     served = delay_of(env, delay).acted()
     if served.maximum > spec.delay:
@@ -136,7 +137,15 @@ TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
 """Streams of `reset_seed`: training, evaluation and `evaluate` share no start states."""
 
 
-def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None, seed: int = 0) -> dict[str, Any]:
+def evaluate(
+    run: str | Path,
+    episodes: int = 10,
+    delay: int | str | None = None,
+    seed: int = 0,
+    *,
+    env: TaskLike | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Play the policy of a run folder on start states that it never saw.
 
     Args:
@@ -144,6 +153,8 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None
         episodes: how many.
         delay: any delay that it can serve, a number or a text; None for the one it was trained for.
         seed: of the start states.
+        env: what makes the environment, as `load`.
+        env_kwargs: keyword arguments of it, as `load`.
 
     Returns:
         agent, env, delay, episodes, mean_return, std_return, returns.
@@ -151,30 +162,40 @@ def evaluate(run: str | Path, episodes: int = 10, delay: int | str | None = None
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
-    policy, config = load(run), Run(Path(run)).config
-    return _play(policy, config, config["delay"] if delay is None else delay, episodes, seed)
+    config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
+    return _play(load(run, task), config, task, config["delay"] if delay is None else delay, episodes, seed)
 
 
-def sweep(run: str | Path, episodes: int = 10, seed: int = 0) -> Iterator[dict[str, Any]]:
+def sweep(
+    run: str | Path,
+    episodes: int = 10,
+    seed: int = 0,
+    *,
+    env: TaskLike | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
-    policy, config = load(run), Run(Path(run)).config
+    config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
+    policy = load(run, task)
     for delay in range(policy.spec.delay + 1):
-        yield _play(policy, config, delay, episodes, seed)
+        yield _play(policy, config, task, delay, episodes, seed)
 
 
-def _play(policy: Policy, config: dict[str, Any], delay: int | str, episodes: int, seed: int) -> dict[str, Any]:
+def _play(
+    policy: Policy, config: dict[str, Any], task: Task, delay: int | str, episodes: int, seed: int
+) -> dict[str, Any]:
     if episodes < 1:
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
     check_seed(seed)
-    parsed = delay_of(config["env"], delay)
-    evaluator = Evaluator(policy.agent, policy.spec, config["env"], parsed, 1, episodes)
+    parsed = delay_of(task, delay)
+    evaluator = Evaluator(policy.agent, policy.spec, task, parsed, 1, episodes)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
     with jax.default_matmul_precision("float32"):  # a GPU's own is coarser
         returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
     return {
         "agent": config["agent"],
-        "env": config["env"],
+        "env": str(task),
         "delay": parsed.label(),
         "episodes": episodes,
         "mean_return": float(returns.mean()),

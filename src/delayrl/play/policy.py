@@ -1,5 +1,6 @@
 """Trained policies: `load` a run, then `act` on what the wrapper shows."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from delayrl.agents.base import Agent, State, template
 from delayrl.core.types import Spec
 from delayrl.core.views import seen_now
 from delayrl.envs import make
+from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import restore_tree
 from delayrl.run.checkpoint import Checkpoint
@@ -60,21 +62,31 @@ class Policy:
         return self.low + (action + 1) / 2 * (self.high - self.low)
 
 
-def load(path: str | Path) -> Policy:
+def load(path: str | Path, env: TaskLike | None = None, *, env_kwargs: Mapping[str, Any] | None = None) -> Policy:
     """Load the policy of a run folder from its newest good checkpoint.
 
+    Args:
+        path: the run folder.
+        env: what makes its environment, if the run cannot name it (a lambda) or may not (docs/own-task.md). It gets the
+            keyword arguments and wrappers of the run.
+        env_kwargs: keyword arguments of the environment that replace or complete the run's.
+
     Raises:
-        DelayRLError: no run folder, no good checkpoint, or one of another agent.
+        DelayRLError: no run folder, no good checkpoint, one of another agent, a task that cannot be made.
     """
     run = Run(Path(path))
-    config = run.config
-    return restored(config, run.latest())
+    return restored(run.config, run.latest(), task_of(path, env, env_kwargs))
 
 
-def restored(config: dict[str, Any], checkpoint: Checkpoint) -> Policy:
-    """Load the policy in a checkpoint of a run with this configuration."""
+def task_of(path: str | Path, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
+    """Return the task of a run folder, or the one given instead, as `load`."""
+    return stored_task(Run(Path(path)).config["env"], Path(path), env, env_kwargs)
+
+
+def restored(config: dict[str, Any], checkpoint: Checkpoint, task: Task) -> Policy:
+    """Load the policy in a checkpoint of a run with this configuration, whose task is looked up."""
     agent = agent_of(config)
-    env = make(config["env"], config["delay"])
+    env = make(task, config["delay"])
     spec = spec_of(env)
     state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
     env.close()

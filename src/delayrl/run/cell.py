@@ -24,7 +24,7 @@ class Cell:
     def folder(self) -> str:
         """The name of its folder: readable, and unique."""
         condition = self.condition
-        return re.sub(r"[^\w.-]+", "-", f"{condition.env}-delay{condition.label}-{condition.agent}-{self.id}")
+        return re.sub(r"[^\w.-]+", "-", f"{condition.place}-{condition.agent}-{self.id}")
 
     @property
     def json(self) -> dict[str, Any]:

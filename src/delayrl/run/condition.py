@@ -14,6 +14,7 @@ from delayrl.core.replay import Learnable
 from delayrl.core.types import Spec
 from delayrl.delays import Delay, DelayLike, as_delay, short_label
 from delayrl.envs import delay_of
+from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.run.configuration import OLDER, check_names, override, values_of
 from delayrl.run.rows import CONDITION
@@ -33,7 +34,7 @@ class Condition:
     """One agent with its hyperparameters, on one task, under one delay and one protocol."""
 
     agent: str  # its name in the registry
-    env: str  # the id of the task
+    env: str  # the text of the task: an id, or what delayrl.envs.task says
     delay: int | str  # environment steps, or a delay's text
     preset: str = "paper"
     protocol: str = "corrected"
@@ -44,6 +45,11 @@ class Condition:
     def label(self) -> int | str:
         """The delay as rows name it: long lists of numbers are shortened."""
         return short_label(self.delay)
+
+    @property
+    def place(self) -> str:
+        """The task and the delay as folders are named by them: without brackets at the ends, and not too long."""
+        return f"{self.env.strip('<>() ')[:100]}-delay{self.label}"
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -72,6 +78,7 @@ class Setup:
     """A condition, and the objects that it stands for."""
 
     condition: Condition
+    task: Task
     agent: Agent
     schedule: Schedule
     delay: Delay
@@ -122,7 +129,9 @@ def _digest(parts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, overrides: Mapping[str, Any]) -> Setup:
+def resolve(
+    agent: str, env: TaskLike, delay: DelayLike, preset: str, protocol: str, overrides: Mapping[str, Any]
+) -> Setup:
     """Resolve what a user gave into a condition and its objects. Raises DelayRLError for what does not exist or fit."""
     registration = find_agent(agent)
     if preset not in registration.presets:
@@ -132,19 +141,20 @@ def resolve(agent: str, env: str, delay: DelayLike, preset: str, protocol: str, 
     values = {**chosen.overrides, **overrides}
     values = following(preset, base, override(base.schedule, values).steps) | values
     schedule = override(base.schedule, values)
-    parsed = delay_of(env, delay)
+    task = as_task(env)
+    parsed = delay_of(task, delay)
     text = parsed.plain()
     if not isinstance(delay, int | float | str) and as_delay(text) != parsed:
         raise DelayRLError(
             f"a run keeps its delay as text, and {str(parsed)[:60]!r} cannot be read back: use delayrl.delays"
         )
-    condition = Condition(agent, env, text, preset, protocol, dict(overrides), schedule.steps)
+    condition = Condition(agent, str(task), text, preset, protocol, dict(overrides), schedule.steps)
     made = override(base.agent, values)
     if for_run := getattr(made, "for_run", None):
         made = for_run(schedule)
     if schedule.observation_norm == "running":
         made = NormalisedObservations(made)
-    return Setup(condition, made, schedule, parsed, chosen)
+    return Setup(condition, task, made, schedule, parsed, chosen)
 
 
 def following(name: str, preset: Preset, steps: int) -> dict[str, int]:

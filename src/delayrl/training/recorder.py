@@ -28,12 +28,12 @@ class Recorder:
         }
         self._physics = physics(env)
         self._trackers = [Tracker(track, run.path) for run in group.runs]
-        name, delay = setup.condition.env, setup.delay
+        task, delay = setup.task, setup.delay
         shape = (len(group.seeds), setup.schedule.evaluation_episodes, group.apply)
-        self._evaluators = {"agent": Evaluator(setup.agent, group.spec, name, delay, *shape)}
+        self._evaluators = {"agent": Evaluator(setup.agent, group.spec, task, delay, *shape)}
         if reference := setup.agent.reference_policy(agent):
             spec = Spec(group.spec.obs_size, group.spec.action_size, 0)
-            self._evaluators["reference"] = Evaluator(reference[0], spec, name, 0, *shape)
+            self._evaluators["reference"] = Evaluator(reference[0], spec, task, 0, *shape)
 
     def evaluate(self, step: int, agent: State) -> str:
         """Play the evaluation episodes of a step, write a row for each. Returns the mean returns in words."""

@@ -2,7 +2,7 @@
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +15,7 @@ from tqdm import tqdm
 from delayrl.agents.base import PRODUCTS, State, template
 from delayrl.delays import DelayLike
 from delayrl.envs import make
+from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
@@ -27,13 +28,17 @@ from delayrl.training.loop import run
 from delayrl.training.resume import start
 from delayrl.training.state import Group
 from delayrl.wrappers import Delayed
+from delayrl.wrappers.single import limit_of
 
 
 def train(
     agent: str,
-    env: str,
+    env: TaskLike,
     delay: DelayLike = 0,
     *,
+    env_kwargs: Mapping[str, Any] | None = None,
+    wrappers: Sequence[WrapperLike] = (),
+    flatten: bool = False,
     preset: str = "paper",
     seed: int = 0,
     seeds: int = 1,
@@ -50,8 +55,12 @@ def train(
 
     Args:
         agent: its name in the registry (`delayrl agents`).
-        env: id of a Gymnasium task (`delayrl tasks`).
+        env: id of a Gymnasium task (`delayrl tasks`), `module:object`, a spec, or a class or function that makes an
+            environment.
         delay: environment steps, or a text such as "uniform:1:5@fifo" or "80ms+action=2" (`delayrl.delays`).
+        env_kwargs: keyword arguments of the environment. With `wrappers` and `flatten` they are part of its name.
+        wrappers: as `make`.
+        flatten: as `make`.
         preset: "paper" or "small": which hyperparameters to start from.
         seed: fixes everything: environments, networks, sampling.
         seeds: trains the seeds seed .. seed + seeds - 1 in lockstep.
@@ -70,7 +79,7 @@ def train(
     Raises:
         DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
     """
-    setup = resolve(agent, env, delay, preset, protocol, values)
+    setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
     for name, count in (("seeds", seeds), ("threads", threads)):
         if count < 1:
             raise DelayRLError(f"{name} must be at least 1; got {count}")
@@ -79,7 +88,7 @@ def train(
     numbers = list(range(seed, seed + seeds))
     runs = run_folders(setup.condition, numbers, out)
     observed = setup.delay.observed()
-    envs = [make(env, observed, rescale=True) for _ in numbers]
+    envs = [make(setup.task, observed, rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
     if device != "gpu":
@@ -105,7 +114,7 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
     kind = f"{condition.agent}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"
-    task = re.sub(r"[^\w.=+@-]+", "-", f"{condition.env}-delay{condition.label}")
+    task = re.sub(r"[^\w.=+@-]+", "-", condition.place)
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
         return [Run(home)]
@@ -114,7 +123,7 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
 
 def check_fit(setup: Setup, env: Delayed) -> State:
     """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
-    agent, schedule, spec, task = setup.agent, setup.schedule, spec_of(env), env.spec
+    agent, schedule, spec = setup.agent, setup.schedule, spec_of(env)
     least = 2 * (spec.delay + agent.ahead(spec)) + 2
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
@@ -122,9 +131,9 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
-    if task is None or task.max_episode_steps is None:
-        name = task.id if task else "the task"
-        raise DelayRLError(f"{name} has no time limit, so evaluation may never end; register it with one")
+    if limit_of(env) is None:
+        hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'"
+        raise DelayRLError(f"{setup.task} has no time limit, so evaluation may never end; {hint}")
     return template(agent, spec)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from delayrl.delays import Delay
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Delayed, Info
+from delayrl.wrappers.single import Info, check_spaces, find_delayed, name_of
 from delayrl.wrappers.vector import DelayedVector
 
 
@@ -54,15 +54,33 @@ def _augment(obs: NDArray[Any], info: Info, history: int, delay: Delay, dtype: A
 
 
 class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
-    """Show the augmented state of an environment wrapped by `Delayed` as one vector, [S + H·A + 1]."""
+    """Show the augmented state of an environment wrapped by `Delayed` as one vector, [S + H·A + 1].
 
-    def __init__(self, env: Delayed) -> None:
-        if not isinstance(env, Delayed):
+    Other wrappers may stand between the two (`NormalizeObservation`, `TimeLimit`). Their observations are shown; the
+    actions of the history are those that reached `Delayed`, in its units.
+
+    Args:
+        env: an environment with a `Delayed` in it. Its observations are still flat vectors, and its `info` is that of
+            `Delayed`.
+
+    Raises:
+        DelayRLError: no `Delayed` in it, another `AugmentedObservation`, or observations that are not flat.
+    """
+
+    def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]]) -> None:
+        delayed, inner = find_delayed(env), env
+        if delayed is None:
             raise DelayRLError("AugmentedObservation goes around Delayed: wrap the task in Delayed first")
+        while inner is not delayed:
+            if isinstance(inner, AugmentedObservation):
+                raise DelayRLError("the observations are augmented already: use one AugmentedObservation")
+            inner = inner.env  # type: ignore[attr-defined]
+        check_spaces(name_of(env), env.observation_space, delayed.action_space)
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
-        self.observation_space = _augmented_space(env.observation_space, env.action_space, env.history, env.delay)
-        self._augment = partial(_augment, history=env.history, delay=env.delay, dtype=self.observation_space.dtype)
+        history, delay = delayed.history, delayed.delay
+        self.observation_space = _augmented_space(env.observation_space, delayed.action_space, history, delay)
+        self._augment = partial(_augment, history=history, delay=delay, dtype=self.observation_space.dtype)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start an episode."""

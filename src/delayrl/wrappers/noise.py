@@ -9,7 +9,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Info, check_spaces, is_delayed, name_of
+from delayrl.wrappers.single import Info, check_spaces, find_delayed, name_of
 
 
 class NoisyActions(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
@@ -33,7 +33,7 @@ class NoisyActions(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]], probability: float) -> None:
         if not 0 <= probability <= 1:
             raise DelayRLError(f"the probability of a random action must be from 0 to 1; got {probability}")
-        if is_delayed(env):
+        if find_delayed(env):
             raise DelayRLError("NoisyActions goes inside Delayed: Delayed(NoisyActions(task, 0.1), delay)")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from delayrl.delays import Delay, DelayLike, as_delay
@@ -21,7 +22,9 @@ _warned: set[str] = set()  # training makes the same task many times
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
     """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
     if not isinstance(observations, Box) or len(observations.shape) != 1:
-        raise DelayRLError(f"{name}: observations must be a Box of flat vectors, not images; got {observations}")
+        got = " ".join(str(observations).split())[:200]
+        hint = "flatten=True (--flatten) turns a Dict or an image into one"
+        raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}: {hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
         raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
     if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
@@ -42,29 +45,39 @@ def seconds_of(env: Any) -> float | None:
     return None
 
 
-def is_delayed(env: Any) -> bool:
-    """Return whether an environment, or one of those that it wraps, is a `Delayed`."""
+def find_delayed(env: Any) -> "Delayed | None":
+    """Return the `Delayed` that an environment is or wraps, if any."""
     while isinstance(env, gym.Wrapper):
         if isinstance(env, Delayed):
-            return True
+            return env
         env = env.env
-    return False
+    return None
 
 
-def check_length(delay: Delay, spec: Any) -> None:
-    """Raise DelayRLError if a delay is longer than an episode of the task with this spec (None: unknown)."""
-    limit = spec.max_episode_steps if spec is not None else None
+def limit_of(env: Any) -> int | None:
+    """Return the time limit of an environment in steps, from its spec or a `TimeLimit` around it; None without one."""
+    if env.spec is not None and env.spec.max_episode_steps is not None:
+        return int(env.spec.max_episode_steps)
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, TimeLimit):  # an environment that was not made by an id has no spec
+            return env._max_episode_steps
+        env = env.env
+    return None
+
+
+def check_length(delay: Delay, name: str, limit: int | None) -> None:
+    """Raise DelayRLError if a delay is longer than an episode of this task, whose time limit may be unknown."""
     longest = max(delay.maximum, delay.reward.maximum)
     if limit is not None and longest > limit:
-        raise DelayRLError(f"a delay of {longest} steps is longer than an episode of {spec.id} ({limit} steps)")
+        raise DelayRLError(f"a delay of {longest} steps is longer than an episode of {name} ({limit} steps)")
 
 
 def history_rows(env: Any, delay: Delay, history: int | None) -> int:
     """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
-    check_length(delay, env.spec)
-    limit = env.spec.max_episode_steps if env.spec is not None else None
+    name, limit = name_of(env), limit_of(env)
+    check_length(delay, name, limit)
     if limit is not None and delay.observation.constant and delay.maximum >= limit - 1:
-        line = f"with a delay of {delay.maximum} steps nothing after the start of an episode of {env.spec.id} "
+        line = f"with a delay of {delay.maximum} steps nothing after the start of an episode of {name} "
         line += f"({limit} steps) is ever observed: the agent acts on s_0 and its own actions alone"
         if line not in _warned:
             _warned.add(line)
@@ -124,7 +137,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
-        if is_delayed(env):
+        if find_delayed(env):
             raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
@@ -133,7 +146,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         gym.Wrapper.__init__(self, env)
         self.history = history_rows(env, self.delay, history)
         self._transit = make_transit(self.delay, self.history, fill, env.action_space, idle)
-        self._limit = env.spec.max_episode_steps if env.spec is not None else None
+        self._limit = limit_of(env)
         self._masks = np.tri(self.history + 1, self.history, -1, bool)  # by age: true in the first `age` slots
         self._dtype = env.action_space.dtype
         self._truth: NDArray[Any] = np.zeros(0)

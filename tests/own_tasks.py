@@ -1,0 +1,69 @@
+"""Tasks such as users bring: a class, functions, wrappers, and modules in a folder of their own."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict
+from gymnasium.wrappers import TimeLimit
+
+
+class Arm(gym.Env):
+    """position' = position + gain · action, reward -|position|."""
+
+    observation_space = Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, gain: float = 1.0, names: Any = None) -> None:
+        self.gain, self.names = gain, names
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.position = self.np_random.uniform(-1, 1, 1)
+        return self.position.copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.position = self.position + self.gain * action.astype(float)
+        return self.position.copy(), -abs(float(self.position[0])), False, False, {}
+
+
+class Camera(gym.ObservationWrapper):
+    """Shows a nested observation: {"arm": {"position": [x], "double": [2x, 2x]}, "bias": [offset]}."""
+
+    def __init__(self, env: gym.Env, offset: float = 0.0) -> None:
+        super().__init__(env)
+        self.offset = offset
+        number, two = Box(-np.inf, np.inf, (1,), np.float64), Box(-np.inf, np.inf, (2, 1), np.float64)
+        self.observation_space = Dict({"arm": Dict({"double": two, "position": number}), "bias": number})
+
+    def observation(self, x: np.ndarray) -> dict:
+        return {"arm": {"double": np.array([2 * x, 2 * x]), "position": x}, "bias": np.array([self.offset])}
+
+
+def make_arm(**kwargs: Any) -> gym.Env:
+    return TimeLimit(Arm(**kwargs), 20)
+
+
+LIMIT = "gymnasium.wrappers:TimeLimit(max_episode_steps=20)"
+MODULE = """
+from own_tasks import Arm, Camera, make_arm
+
+
+def make(**kwargs):
+    return make_arm(**kwargs)
+
+
+class Broken(Arm):
+    def __init__(self, how):
+        if how == "id":
+            import gymnasium
+            gymnasium.make("Nowhere-v3")
+        raise ValueError("the serial port is closed\\nsecond line")
+"""
+
+
+def write_module(folder: Path, name: str, text: str = MODULE) -> Path:
+    """Write a module of a user into a folder."""
+    (folder / f"{name}.py").write_text(text)
+    return folder
