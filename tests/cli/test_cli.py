@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import imageio.v3
 import pytest
 
 from delayrl.agents.registry import AGENTS
@@ -56,19 +57,42 @@ def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "delay 1" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["gif", "mp4"])
-def test_watch(run: Path, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def watch(*words: object) -> subprocess.CompletedProcess[str]:
     """In a process of its own: rendering needs a fresh MuJoCo. Where there is no EGL, one line says so."""
+    done = subprocess.run([sys.executable, "-m", "delayrl", "watch", *map(str, words)], capture_output=True, text=True)
+    if "cannot be rendered here" in done.stderr:
+        assert done.stderr.count("\n") == 1
+        pytest.skip("no EGL here")
+    return done
+
+
+@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # the decoder of the video
+@pytest.mark.parametrize(("kind", "frames", "rest"), [("gif", 26, []), ("mp4", 51, ["--compare"])])
+def test_watch(run: Path, kind: str, frames: int, rest: list[str], tmp_path: Path) -> None:
+    """Reacher has 50 frames a second, of which a GIF shows every second."""
     out = tmp_path / f"episode.{kind}"
-    done = subprocess.run(
-        [sys.executable, "-m", "delayrl", "watch", str(run), "--out", str(out)], capture_output=True, text=True
-    )
-    if done.returncode == 0:
-        assert out.stat().st_size > 3000
-        assert "50 frames" in done.stdout
-    else:
-        assert "cannot be rendered here" in done.stderr
-        assert "Traceback" not in done.stderr
+    done = watch(run, "--out", out, *rest, *([run] if rest else []))
+    assert done.stderr == ""
+    assert done.stdout.count("50 steps, return -") == (2 if rest else 1)
+    video = imageio.v3.imread(out)
+    assert video.shape == (frames, 480, 964 if rest else 480, 3)
+    assert video[-1, 60:].std() > 10  # not empty
+
+
+def test_watch_ends_quietly(run: Path, tmp_path: Path) -> None:
+    """OpenGL's exceptions at the end of a process are not shown, after an error neither."""
+    done = watch(run, "--out", tmp_path / "no" / "such" / "folder.mp4")
+    assert done.returncode == 2
+    assert done.stderr.startswith("delayrl: cannot write ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_watch_compares_on_one_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    (other / "config.json").write_text(json.dumps(json.loads((run / "config.json").read_text()) | {"env": "Ant-v5"}))
+    words = ("watch", str(run), "--out", str(tmp_path / "x.gif"), "--compare", str(other))
+    assert "--compare takes a run on Reacher-v5; got one on Ant-v5" in refused(capsys, *words)
 
 
 def test_help_needs_no_jax() -> None:

@@ -11,11 +11,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, help="an .mp4 or .gif file")
     add("--delay", metavar="DELAY", help="a delay up to the longest of the training (default: that of the training)")
     add("--seed", type=int, default=0, help="seed of the start state (default: 0)")
+    add("--camera", metavar="NAME", help="a camera of the MuJoCo model (default: track, or one that follows the robot)")
+    add("--compare", type=Path, metavar="RUN2", help="show a run on the same task beside it, from the same start state")
 
 
 def run(given: argparse.Namespace) -> None:
     """Render the episode, and print its length and return."""
     from delayrl.play.video import watch
 
-    frames, total = watch(given.run, given.out, given.delay, given.seed)
-    print(f"{given.out}: {frames} frames, return {total:.1f}")
+    moments = watch(given.run, given.out, given.delay, given.seed, given.camera, given.compare)
+    results = (f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
+    print(f"{given.out}: {'; beside it '.join(results)}")
