@@ -39,7 +39,7 @@ def runaway(base):
     class Runaway(base):
         def step(self, action):
             result = super().step(action)
-            self.data.qpos[0] += 1  # metres
+            self.data.qpos[0] += 6  # metres
             return result
     return Runaway
 
@@ -63,14 +63,18 @@ for name in ("Track-v0", "Camera-v0"):
     cam = env.unwrapped.mujoco_renderer.viewer.cam
     cam.lookat[:] = 0, 0, 0
     found[name] = [robot(first.picture), robot(last.picture), robot(render(env))]
+    found[name] += [float(moment.picture[-60:].std()) for moment in (first, last)]
     close(env)
 print(json.dumps(found))
 """
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[int]]:
-    """Pixels of robots that run 15 metres: in the first frame, the last, and one of a camera that stays behind."""
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[float]]:
+    """Pixels of robots that run 90 metres: in the first frame, the last, and one of a camera that stays behind.
+
+    Then the contrast of the floor, in the first frame and in the last.
+    """
     folder = tmp_path_factory.mktemp("video")
     done = subprocess.run([sys.executable, "-c", RENDERED, str(folder)], capture_output=True, text=True)
     if "cannot be rendered here" in done.stderr:
@@ -80,12 +84,24 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[int]]:
 
 
 @pytest.mark.parametrize("name", ["Track-v0", "Camera-v0"])
-def test_the_robot_is_in_a_late_frame(found: dict[str, list[int]], name: str) -> None:
+def test_the_robot_is_in_a_late_frame(found: dict[str, list[float]], name: str) -> None:
     """Of a model with a camera `track`, and of one without cameras. Both are rendered in one process."""
-    first, last, behind = found[name]
+    first, last, behind, floor, floor_there = found[name]
     assert first > 2000
     assert last > first / 2
     assert behind < first / 20
+    assert floor_there > floor / 2 > 10
+
+
+def test_the_camera_changes_no_physics() -> None:
+    seen = []
+    for moved in (False, True):
+        env = make("HalfCheetah-v5", 0, render_mode="rgb_array")
+        env.reset(seed=3)
+        if moved:
+            aim(env, None)
+        seen.append([env.step(np.ones(6, np.float32))[0] for _ in range(50)])
+    np.testing.assert_array_equal(*seen)
 
 
 BODIES = {

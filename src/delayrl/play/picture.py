@@ -13,6 +13,7 @@ Picture = NDArray[np.uint8]
 """[height, width, 3]"""
 GAP = 4  # pixels between two pictures
 FREE, SLIDE = 0, 2  # MuJoCo's mjtJoint
+PLANE = 0  # MuJoCo's mjtGeom
 
 
 def aim(env: Any, camera: str | None) -> None:
@@ -32,13 +33,23 @@ def aim(env: Any, camera: str | None) -> None:
         known = ", ".join(filter(None, names)) or "none"
         raise DelayRLError(f"{env.spec.id} has no camera {camera!r}; it has {known}")
     if camera or "track" in names:
+        _extend_floor(model)
         renderer.camera_id = names.index(camera or "track")
     elif (body := moving_base(model)) is not None:
         import mujoco
 
+        _extend_floor(model)
         env.render()  # makes the viewer
         renderer.camera_id = None  # a number would undo the type that is set here
         renderer.viewer.cam.type, renderer.viewer.cam.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, body
+
+
+def _extend_floor(model: Any) -> None:
+    """Draw the floor of a MuJoCo model 25 times as far. Contacts know no end of it anyway."""
+    floors = np.flatnonzero((model.geom_type == PLANE) & (model.geom_bodyid == 0))
+    model.geom_size[floors, :2] *= 25
+    stretched = [material for material in set(model.geom_matid[floors]) - {-1} if not model.mat_texuniform[material]]
+    model.mat_texrepeat[stretched] *= 25
 
 
 def moving_base(model: Any) -> int | None:
