@@ -1,5 +1,6 @@
 """What a user types. Errors: one line on stderr, exit status 2, no traceback."""
 
+import argparse
 import json
 import shutil
 import subprocess
@@ -9,8 +10,11 @@ from pathlib import Path
 import imageio.v3
 import pytest
 
+import delayrl
 from delayrl.agents.registry import AGENTS
+from delayrl.cli.console import Parser
 from delayrl.cli.main import COMMANDS, main
+from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
 from delayrl.run.folder import Run
 
@@ -95,6 +99,43 @@ def test_watch_compares_on_one_task(run: Path, tmp_path: Path, capsys: pytest.Ca
     assert "--compare takes a run on Reacher-v5; got one on Ant-v5" in refused(capsys, *words)
 
 
+def given(*words: str) -> argparse.Namespace:
+    """What `delayrl train vdpo` makes of its words."""
+    parser = Parser(prog="train")
+    add_options(parser, ["vdpo"])
+    return parser.read(["vdpo", "--env", "Reacher-v5", *words])
+
+
+@pytest.mark.parametrize("words", ["32,16,8", "32 16 8", "32,16 8", "3.2e1,1_6,8"])
+def test_several_numbers(words: str) -> None:
+    assert given("--hidden", *words.split()).hidden == [32, 16, 8]
+    assert given("--log-std-range", "-20,2").log_std_range == [-20.0, 2.0]
+    assert given("--log-std-range", "-20", "2").log_std_range == [-20.0, 2.0]
+
+
+@pytest.mark.parametrize("text", ["100000", "1e5", "100_000", "1.0e+5"])
+def test_whole_numbers(text: str) -> None:
+    assert given("--steps", text).steps == 100_000
+    assert type(given("--steps", text).steps) is int
+
+
+@pytest.mark.parametrize("option", ["--random-steps", "--random_steps"])
+def test_underscores(option: str) -> None:
+    """In the name of an option; a value keeps its own."""
+    assert given(option, "7").random_steps == 7
+    assert given(f"{option}=7", "--out=a_b", "--env=x_y") == given(
+        "--random-steps", "7", "--out", "a_b", "--env", "x_y"
+    )
+    assert given("--out=a_b").out == Path("a_b")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"delayrl {delayrl.__version__}\n"
+
+
 def test_help_needs_no_jax() -> None:
     program = (
         "import sys; from delayrl.cli.main import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
@@ -146,7 +187,12 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train sac --env Reacher-v5 --delay 3", "delay-free reference"),
         ("train vdpo --env CartPole-v1 --delay 3", "continuous"),
         ("train vdpo --env Reacher-v5 --delay 3 --learnin-rate 3", "did you mean --learning-rate"),
+        ("train vdpo --env Reacher-v5 --lr 3", "'--lr 3'; did you mean --learning-rate, --actor-learning-rate, --"),
+        ("train vdpo --env Reacher-v5 --xyz 3", "unexpected '--xyz 3' (see"),
         ("train vdpo --env Reacher-v5 --delay 3 --learning-rate high", "invalid float"),
+        ("train vdpo --env Reacher-v5 --steps 2.5", "--steps: must be a whole number; got '2.5'"),
+        ("train vdpo --env Reacher-v5 --seed inf", "--seed: must be a whole number; got 'inf'"),
+        ("train vdpo --env Reacher-v5 --hidden 32,wide", "--hidden: must be a whole number; got 'wide'"),
         ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
         ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
         ("bench run first --wrokers 2", "unexpected '--wrokers 2' (see"),

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import print_table
+from delayrl.cli.console import Numbers, print_table, whole
 from delayrl.errors import DelayRLError
 
 
@@ -13,8 +13,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("bundle", type=Path, help="the folder of the bundle")
     add("--period", type=float, metavar="MS", help="the control period (default: the task's step)")
     add("--backend", choices=["numpy", "onnx", "jax"], help="(default: all that are installed)")
-    add("--ages", type=int, nargs="+", metavar="N", help="(default: 5, 25, 50 and the longest)")
-    add("--decisions", type=int, default=2000, metavar="N", help="decisions for each age (default: 2000)")
+    add("--ages", **Numbers.of(whole), metavar="N", help="(default: 5, 25, 50 and the longest)")
+    add("--decisions", type=whole, default=2000, metavar="N", help="decisions for each age (default: 2000)")
 
 
 def run(given: argparse.Namespace) -> None:

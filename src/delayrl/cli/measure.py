@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from delayrl.cli.console import whole
 from delayrl.errors import DelayRLError, first_line
 from delayrl.measure.log import Estimated, from_log, plot
 from delayrl.measure.probing import Counts, Probed, probe
@@ -26,9 +27,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("target", metavar="ENV|LOG", help="a Gymnasium task, module:function that makes one, or a CSV or Parquet file")
     add("--json", action="store_true", help="print one JSON object")
-    add("--seed", type=int, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
+    add("--seed", type=whole, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
     add("--longest", metavar="N|TIME", help="the longest delay to look for: steps (200), or time (100 rows of the log)")
-    parser.add_argument_group("environment").add_argument("--episodes", type=int, help="episodes to play (default: 8)")
+    parser.add_argument_group("environment").add_argument(
+        "--episodes", type=whole, help="episodes to play (default: 8)"
+    )
     add = parser.add_argument_group("log").add_argument
     add("--period", metavar="TIME", help="control period, e.g. 20ms or 50Hz (default: the spacing of the rows)")
     add("--time", metavar="NAME", help="column of the time stamps (default: time, timestamp or t)")

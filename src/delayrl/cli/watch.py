@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from delayrl.cli.console import whole
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the run folder, the file, and the episode to play."""
@@ -10,7 +12,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("run", type=Path, help="the run folder")
     add("--out", type=Path, required=True, help="an .mp4 or .gif file")
     add("--delay", metavar="DELAY", help="a delay up to the longest of the training (default: that of the training)")
-    add("--seed", type=int, default=0, help="seed of the start state (default: 0)")
+    add("--seed", type=whole, default=0, help="seed of the start state (default: 0)")
     add("--camera", metavar="NAME", help="a camera of the MuJoCo model (default: track, or one that follows the robot)")
     add("--compare", type=Path, metavar="RUN2", help="show a run on the same task beside it, from the same start state")
 
