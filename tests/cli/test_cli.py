@@ -47,8 +47,18 @@ def test_train_ends_with_a_summary(run: Path, capsys: pytest.CaptureFixture[str]
     main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "3", "--out", str(run), *TINY[:-1]])
     out, err = capsys.readouterr()
     assert "already complete at step 240" in err
+    assert "delay: 3 steps = 60 ms\n" in err
     for words in ("return under delay", "its reference, no delay", str(run), "delayrl evaluate", "curve.png"):
         assert words in out
+
+
+def test_a_delay_in_time(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is rounded up to steps, and says to how many."""
+    main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "50ms", "--out", str(run), *TINY[:-1]])
+    out, err = capsys.readouterr()
+    assert "delay: 3 steps of 20 ms\n" in err
+    main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "50ms", "--out", str(run), *TINY])
+    assert capsys.readouterr() == (out, "")
 
 
 def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

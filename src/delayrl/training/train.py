@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from tqdm import tqdm
 
 from delayrl.agents.base import PRODUCTS, State, template
-from delayrl.delays import DelayLike
-from delayrl.envs import make
+from delayrl.delays import DelayLike, in_other_unit
+from delayrl.envs import make, seconds_of
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
@@ -96,6 +96,8 @@ def train(
             if progress:
                 tqdm.write(line, file=sys.stderr)
 
+        if setup.delay.maximum and (seconds := seconds_of(envs[0])):
+            note(f"delay: {in_other_unit(delay, setup.delay, seconds)}")
         run(group, start(group, actors, overwrite, note), note, progress=progress, track=track)
     return runs[0] if seeds == 1 else runs
 
