@@ -182,7 +182,9 @@ def test_complete_run_is_given_back(vdpo: Run, monkeypatch) -> None:
 
 def test_several_seeds(tmp_path: Path) -> None:
     """Each seed has its own folder, and the same start states and random steps as when it is trained alone."""
-    runs = train("a-sac", tmp_path / "group", seeds=2, seed=3, steps=150)
+    runs = train("a-sac", tmp_path / "group", seeds=[3, 4], steps=150)
+    again = train("a-sac", tmp_path / "group", seeds=2, seed=3, steps=150)
+    assert [run.path for run in again] == [run.path for run in runs]
     assert [run.path.name for run in runs] == ["seed3", "seed4"]
     alone = train("a-sac", tmp_path / "alone", seed=4, steps=150)
     for a, b in zip(runs[1].read("rows"), alone.read("rows"), strict=True):
@@ -254,6 +256,12 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"representation": "lstm"}, "one of"),
         ({"hidden": [8, -1]}, "at least 1"),
         ({"seed": -1}, "seed"),
+        ({"seeds": []}, "a list of different seeds"),
+        ({"seeds": [1, 1]}, "a list of different seeds"),
+        ({"seeds": [0.5]}, "a list of different seeds"),
+        ({"seeds": [0, 1], "seed": 3}, "without seed="),
+        ({"seeds": [0, -1]}, "a seed must be"),
+        ({"seeds": 0}, "seeds must be at least 1"),
         ({"device": "tpu"}, "cpu or gpu"),
         ({"replay_capacity": 5}, "at least"),
         ({"track": "paper"}, "tensorboard or wandb"),
