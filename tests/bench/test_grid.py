@@ -220,6 +220,7 @@ BAD = [
     (BASIC + "[overrides]\nbatch_sise = 3\n", "did you mean batch_size"),
     (BASIC + "[overrides]\nwidth = 3\n", "unknown hyperparameter 'width'"),
     (BASIC + "[[product]]\n[product.overrides]\nwidth = 3\n", "product 1: unknown hyperparameter 'width'"),
+    (BASIC + "[overrides]\nsteps = 900\n", "nothing would be learned: the first update is at step 1,000"),
     (BASIC + "[overrides]\nreplay_capacity = 5\n", "replay_capacity must be at least"),
     (BASIC + "[overrides.vpdo]\nwidth = 3\n", "did you mean vdpo"),
     (BASIC + "[overrides]\nbpql = 3\n[[product]]\n[product.overrides.bpql]\nsteps = 9\n", "a table in one place"),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 
 import delayrl
 from conftest import quick
+from delayrl.envs import make
 from delayrl.play.evaluation import Evaluator
+from delayrl.run.condition import resolve
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
+from delayrl.training.train import check_fit
 from short_runs import arrays, train
 
 
@@ -264,12 +268,30 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"seeds": 0}, "seeds must be at least 1"),
         ({"device": "tpu"}, "cpu or gpu"),
         ({"replay_capacity": 5}, "at least"),
+        (
+            {"steps": 99},
+            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_st",
+        ),
+        ({"steps": 100, "update_every": 101, "clone_every": 102}, "the first update is at step 101"),
+        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after, or preset"),
         ({"track": "paper"}, "tensorboard or wandb"),
     ],
 )
 def test_bad_values(values: dict, words: str, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match=words):
         train("vdpo", tmp_path / "run", **values)
+
+
+@pytest.mark.parametrize(
+    ("steps", "every", "fits"), [(100, 1, True), (99, 1, False), (119, 40, False), (120, 40, True)]
+)
+def test_a_run_learns_something(steps: int, every: int, fits: bool) -> None:
+    """Updates are due at multiples of `update_every`, from random_steps on; one is enough."""
+    values = {"steps": steps, "update_every": every, "random_steps": 100}
+    setup, task = resolve("bpql", "Reacher-v5", 3, "small", "corrected", values), make("Reacher-v5", 3, rescale=True)
+    with nullcontext() if fits else pytest.raises(delayrl.DelayRLError, match="nothing would be learned"):
+        check_fit(setup, task)
+    check_fit(resolve("random", "Reacher-v5", 3, "small", "corrected", {"steps": steps}), task)  # never learns
 
 
 def test_unknown_agent() -> None:

@@ -134,6 +134,13 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
+    first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
+    if first > schedule.steps:
+        start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
+        raise DelayRLError(
+            f"nothing would be learned: the first update is at step {first:,}, and the run ends at step "
+            f"{schedule.steps:,}; give more steps, {start}, or preset small"
+        )
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
