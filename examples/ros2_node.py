@@ -90,8 +90,11 @@ def settings_of(node: Any) -> dict[str, Any]:
 
 
 def main() -> None:
-    import rclpy
-    from rclpy.node import Node
+    try:
+        import rclpy
+        from rclpy.node import Node
+    except ImportError:
+        sys.exit("delayed_policy: needs ROS 2 and its Python package rclpy: source /opt/ros/DISTRO/setup.bash first")
 
     from delayrl.deploy import load_bundle
 

@@ -1,5 +1,9 @@
 """The exceptions that people see, as a single line."""
 
+import difflib
+import re
+from collections.abc import Iterable
+
 
 class DelayRLError(Exception):
     """Bad input or a broken file: what was given, what is allowed, what to try, in one line."""
@@ -11,6 +15,16 @@ class StoppedError(DelayRLError):
 
 class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
+
+
+def near_names(name: str, known: Iterable[str]) -> list[str]:
+    """Return up to three known names that may be meant: by the initials of their words (`lr`), or by their spelling."""
+    known, letters = list(known), name.strip("-").lower()
+    initials = {other: "".join(word[0] for word in re.findall(r"[^\W_]+", other)) for other in known}
+    abbreviated = [other for other in sorted(known, key=len) if initials[other].endswith(letters)]
+    if len(letters) > 1 and abbreviated:
+        return abbreviated[:3]
+    return difflib.get_close_matches(name, known, n=3, cutoff=0.6)
 
 
 def first_line(error: BaseException) -> str:

@@ -115,6 +115,34 @@ def test_overrides_of_all_of_a_product_and_of_an_agent(tmp_path: Path) -> None:
     assert cells["vdpo", 3].steps == 6000
 
 
+def test_overrides_of_all_agents_skip_those_without_the_option(tmp_path: Path) -> None:
+    """Of the whole grid, and of one product; each name needs one agent that has it."""
+    text = """
+    preset = "small"
+    tasks = ["Reacher-v5"]
+    [overrides]
+    width = 16
+    discount = 0.9
+    [[product]]
+    agents = ["random", "bpql", "vdpo"]
+    delays = [2]
+    [product.overrides]
+    updates = 2
+    [[product]]
+    agents = ["sac"]
+    delays = [0]
+    """
+    conditions = [cell.condition for cell in load_grid(write(tmp_path, text)).cells]
+    assert {condition.agent: condition.overrides for condition in conditions} == {
+        "random": {},
+        "bpql": {"discount": 0.9, "updates": 2},
+        "vdpo": {"width": 16, "discount": 0.9, "updates": 2},
+        "sac": {"discount": 0.9},
+    }
+    alone = 'preset = "small"\nagents = ["random"]\ntasks = ["Reacher-v5"]\ndelays = [2]\n'
+    assert ids(tmp_path, alone) < ids(tmp_path, text)
+
+
 def test_included_grids(tmp_path: Path) -> None:
     write(tmp_path, BASIC, "one")
     both = load_grid(write(tmp_path, 'include = ["one.toml"]\n[[product]]\nagents = ["sac"]\n' + extra, "both"))
@@ -190,6 +218,9 @@ BAD = [
     (BASIC.replace("[2, 3]", "3"), "delays must be a list"),
     (BASIC.replace('"bpql"', '"sac"'), "delay-free reference"),
     (BASIC + "[overrides]\nbatch_sise = 3\n", "did you mean batch_size"),
+    (BASIC + "[overrides]\nwidth = 3\n", "unknown hyperparameter 'width'"),
+    (BASIC + "[[product]]\n[product.overrides]\nwidth = 3\n", "product 1: unknown hyperparameter 'width'"),
+    (BASIC + "[overrides]\nsteps = 900\n", "nothing would be learned: the first update is at step 1,000"),
     (BASIC + "[overrides]\nreplay_capacity = 5\n", "replay_capacity must be at least"),
     (BASIC + "[overrides.vpdo]\nwidth = 3\n", "did you mean vdpo"),
     (BASIC + "[overrides]\nbpql = 3\n[[product]]\n[product.overrides.bpql]\nsteps = 9\n", "a table in one place"),

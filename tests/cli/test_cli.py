@@ -1,5 +1,6 @@
 """What a user types. Errors: one line on stderr, exit status 2, no traceback."""
 
+import argparse
 import json
 import shutil
 import subprocess
@@ -8,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+import delayrl
 from delayrl.agents.registry import AGENTS
+from delayrl.cli.console import Parser
 from delayrl.cli.main import COMMANDS, main
+from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
 from delayrl.run.folder import Run
 
@@ -42,8 +46,18 @@ def test_train_ends_with_a_summary(run: Path, capsys: pytest.CaptureFixture[str]
     main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "3", "--out", str(run), *TINY[:-1]])
     out, err = capsys.readouterr()
     assert "already complete at step 240" in err
+    assert "delay: 3 steps = 60 ms\n" in err
     for words in ("return under delay", "its reference, no delay", str(run), "delayrl evaluate", "curve.png"):
         assert words in out
+
+
+def test_a_delay_in_time(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is rounded up to steps, and says to how many."""
+    main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "50ms", "--out", str(run), *TINY[:-1]])
+    out, err = capsys.readouterr()
+    assert "delay: 3 steps of 20 ms\n" in err
+    main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "50ms", "--out", str(run), *TINY])
+    assert capsys.readouterr() == (out, "")
 
 
 def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,19 +70,80 @@ def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "delay 1" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["gif", "mp4"])
-def test_watch(run: Path, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def watch(*words: object) -> subprocess.CompletedProcess[str]:
     """In a process of its own: rendering needs a fresh MuJoCo. Where there is no EGL, one line says so."""
+    done = subprocess.run([sys.executable, "-m", "delayrl", "watch", *map(str, words)], capture_output=True, text=True)
+    if "cannot be rendered here" in done.stderr:
+        assert done.stderr.count("\n") == 1
+        pytest.skip("no EGL here")
+    return done
+
+
+@pytest.mark.parametrize(("kind", "frames", "rest"), [("gif", 26, []), ("mp4", 51, ["--compare"])])
+def test_watch(run: Path, kind: str, frames: int, rest: list[str], tmp_path: Path) -> None:
+    """Reacher has 50 frames a second, of which a GIF shows every second."""
     out = tmp_path / f"episode.{kind}"
-    done = subprocess.run(
-        [sys.executable, "-m", "delayrl", "watch", str(run), "--out", str(out)], capture_output=True, text=True
+    done = watch(run, "--out", out, *rest, *([run] if rest else []))
+    assert done.stderr == ""
+    assert done.stdout.count("50 steps, return -") == (2 if rest else 1)
+    look = "import sys, imageio.v3; v = imageio.v3.imread(sys.argv[1]); print([*v.shape, int(v[-1, 60:].std())])"
+    decoded = subprocess.run([sys.executable, "-c", look, str(out)], capture_output=True, text=True)
+    *shape, contrast = json.loads(decoded.stdout)
+    assert shape == [frames, 480, 964 if rest else 480, 3]
+    assert contrast > 10  # the last frame is not empty
+
+
+def test_watch_ends_quietly(run: Path, tmp_path: Path) -> None:
+    """OpenGL's exceptions at the end of a process are not shown, after an error neither."""
+    done = watch(run, "--out", tmp_path / "no" / "such" / "folder.mp4")
+    assert done.returncode == 2
+    assert done.stderr.startswith("delayrl: cannot write ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_watch_compares_on_one_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    (other / "config.json").write_text(json.dumps(json.loads((run / "config.json").read_text()) | {"env": "Ant-v5"}))
+    words = ("watch", str(run), "--out", str(tmp_path / "x.gif"), "--compare", str(other))
+    assert "--compare takes a run on Reacher-v5; got one on Ant-v5" in refused(capsys, *words)
+
+
+def given(*words: str) -> argparse.Namespace:
+    """What `delayrl train vdpo` makes of its words."""
+    parser = Parser(prog="train")
+    add_options(parser, ["vdpo"])
+    return parser.read(["vdpo", "--env", "Reacher-v5", *words])
+
+
+@pytest.mark.parametrize("words", ["32,16,8", "32 16 8", "32,16 8", "3.2e1,1_6,8"])
+def test_several_numbers(words: str) -> None:
+    assert given("--hidden", *words.split()).hidden == [32, 16, 8]
+    assert given("--log-std-range", "-20,2").log_std_range == [-20.0, 2.0]
+    assert given("--log-std-range", "-20", "2").log_std_range == [-20.0, 2.0]
+
+
+@pytest.mark.parametrize("text", ["100000", "1e5", "100_000", "1.0e+5"])
+def test_whole_numbers(text: str) -> None:
+    assert given("--steps", text).steps == 100_000
+    assert type(given("--steps", text).steps) is int
+
+
+@pytest.mark.parametrize("option", ["--random-steps", "--random_steps"])
+def test_underscores(option: str) -> None:
+    """In the name of an option; a value keeps its own."""
+    assert given(option, "7").random_steps == 7
+    assert given(f"{option}=7", "--out=a_b", "--env=x_y") == given(
+        "--random-steps", "7", "--out", "a_b", "--env", "x_y"
     )
-    if done.returncode == 0:
-        assert out.stat().st_size > 3000
-        assert "50 frames" in done.stdout
-    else:
-        assert "cannot be rendered here" in done.stderr
-        assert "Traceback" not in done.stderr
+    assert given("--out=a_b").out == Path("a_b")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"delayrl {delayrl.__version__}\n"
 
 
 def test_help_needs_no_jax() -> None:
@@ -122,7 +197,12 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train sac --env Reacher-v5 --delay 3", "delay-free reference"),
         ("train vdpo --env CartPole-v1 --delay 3", "continuous"),
         ("train vdpo --env Reacher-v5 --delay 3 --learnin-rate 3", "did you mean --learning-rate"),
+        ("train vdpo --env Reacher-v5 --lr 3", "'--lr 3'; did you mean --learning-rate, --actor-learning-rate, --"),
+        ("train vdpo --env Reacher-v5 --xyz 3", "unexpected '--xyz 3' (see"),
         ("train vdpo --env Reacher-v5 --delay 3 --learning-rate high", "invalid float"),
+        ("train vdpo --env Reacher-v5 --steps 2.5", "--steps: must be a whole number; got '2.5'"),
+        ("train vdpo --env Reacher-v5 --seed inf", "--seed: must be a whole number; got 'inf'"),
+        ("train vdpo --env Reacher-v5 --hidden 32,wide", "--hidden: must be a whole number; got 'wide'"),
         ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
         ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
         ("bench run first --wrokers 2", "unexpected '--wrokers 2' (see"),

@@ -14,11 +14,13 @@ from delayrl.delays import (
     Choice,
     Constant,
     Delay,
+    DelayLike,
     Markov,
     Recorded,
     as_delay,
     gamma,
     gilbert_elliott,
+    in_other_unit,
     poisson,
     random_walk,
     recorded,
@@ -128,6 +130,26 @@ def test_recorded_files(tmp_path: Path) -> None:
 )
 def test_times_are_rounded_up(text: str, step: float, maximum: int) -> None:
     assert as_delay(text, step).maximum == maximum
+
+
+@pytest.mark.parametrize(
+    ("value", "step", "words"),
+    [
+        (80, 0.04, "80 steps = 3.2 s"),
+        ("80", 0.04, "80 steps = 3.2 s"),
+        (1, 0.008, "1 step = 8 ms"),
+        ("80ms", 0.04, "2 steps of 40 ms"),
+        ("81ms", 0.04, "3 steps of 40 ms"),
+        ("3s", 1.5, "2 steps of 1.5 s"),
+        ("2+action=1", 0.02, "3 steps = 60 ms"),
+        ("40ms+action=1", 0.02, "3 steps of 20 ms"),
+        ("uniform:1:5", 0.05, "up to 5 steps = 250 ms"),
+        ("uniform:1:5@wait", 0.05, "5 steps = 250 ms"),
+        (uniform(1, 2), 0.05, "up to 2 steps = 100 ms"),
+    ],
+)
+def test_a_delay_in_the_other_unit(value: DelayLike, step: float, words: str) -> None:
+    assert in_other_unit(value, as_delay(value, step), step) == words
 
 
 def test_channels_of_a_text() -> None:

@@ -1,6 +1,8 @@
 """`delayrl export` and `delayrl latency`: the content of a bundle, and where it may be written."""
 
 import json
+import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -215,6 +217,29 @@ def test_latency(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     text = capsys.readouterr().out
     assert "control period 20 ms" in text
     assert "onnx" not in text
+
+
+def test_export_without_onnx(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The bundle has no graph and says so. All else works, and --force adds the graph later."""
+    out = tmp_path / "bundle"
+    with monkeypatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("always")
+        patch.setitem(sys.modules, "onnx", None)
+        main(["export", str(run), "--out", str(out)])
+    err = capsys.readouterr().err
+    assert err.startswith(
+        "delayrl: the bundle has no policy.onnx, because the package onnx is not installed: pip install"
+    )
+    assert err.count("\n") == 1
+    assert sorted(file.name for file in out.iterdir()) == ["bundle.json", "policy.safetensors"]
+    main(["latency", str(out), "--decisions", "5"])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [line[0] for line in lines[1:3]] == ["numpy", "jax"]
+    assert "holds no policy.onnx" in refused(capsys, "latency", str(out), "--backend", "onnx")
+    main(["export", str(run), "--out", str(out), "--force"])
+    assert load_bundle(out, "onnx").metadata["agent"] == "vdpo"
 
 
 @pytest.mark.parametrize("name", ["safetensors", "numpy", "json"])

@@ -20,6 +20,7 @@ from delayrl.cli.measure import seconds
 from delayrl.envs import quiet
 from delayrl.measure import from_log, probe
 from delayrl.measure.log import rounded_up_steps
+from delayrl.measure.reading import read_signals
 from delayrl.wrappers import AugmentedObservation, Delayed
 
 ROOT = Path(__file__).parents[2]
@@ -312,6 +313,28 @@ def write(path: Path, columns: dict, rows: list[int] | None = None) -> Path:
 
 def log(path: Path, u: np.ndarray, y: np.ndarray, time: np.ndarray | None = None) -> Path:
     return write(path, {"time": ROW * np.arange(len(u)) if time is None else time, "command": u, "obs": y})
+
+
+@pytest.mark.parametrize(
+    ("commands", "observations", "wanted"),
+    [
+        (["q1_cmd"], ["q1_cmd_seen"], (["q1_cmd"], ["q1_cmd_seen"])),
+        (["q1_cmd"], ["q1"], (["q1_cmd"], ["q1"])),
+        (["Q1_CMD"], ["Q1"], (["q1_cmd"], ["q1"])),
+        (["q1_cmd", "q2_c"], ["q1", "q2_v"], (["q1_cmd", "q2_cmd"], ["q1", "q2_velocity"])),
+        (["q2_cmd"], ["q2"], (["q2_cmd"], ["q2_velocity"])),
+        (["q1_c"], ["q1"], (["q1_cmd", "q1_cmd_seen"], ["q1"])),
+        (None, ["q1"], (["action", "action_raw"], ["q1"])),
+    ],
+)
+def test_whole_names_come_before_prefixes(
+    commands: list | None, observations: list, wanted: tuple, tmp_path: Path
+) -> None:
+    """A word that is the name of a column means this column alone, and no prefix takes it from there."""
+    names = ["time", "q1", "q1_cmd", "q1_cmd_seen", "q2_cmd", "q2_velocity", "action", "action_raw"]
+    path = write(tmp_path / "log.csv", {name: np.arange(5.0) for name in names})
+    log = read_signals(path, commands=commands, observations=observations)
+    assert (list(log.command_names), list(log.observation_names)) == wanted
 
 
 def test_held_commands(tmp_path: Path) -> None:

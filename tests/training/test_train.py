@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 
 import delayrl
 from conftest import quick
+from delayrl.envs import make
 from delayrl.play.evaluation import Evaluator
+from delayrl.run.condition import resolve
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
+from delayrl.training.train import check_fit
 from short_runs import arrays, train
 
 
@@ -182,7 +186,9 @@ def test_complete_run_is_given_back(vdpo: Run, monkeypatch) -> None:
 
 def test_several_seeds(tmp_path: Path) -> None:
     """Each seed has its own folder, and the same start states and random steps as when it is trained alone."""
-    runs = train("a-sac", tmp_path / "group", seeds=2, seed=3, steps=150)
+    runs = train("a-sac", tmp_path / "group", seeds=[3, 4], steps=150)
+    again = train("a-sac", tmp_path / "group", seeds=2, seed=3, steps=150)
+    assert [run.path for run in again] == [run.path for run in runs]
     assert [run.path.name for run in runs] == ["seed3", "seed4"]
     alone = train("a-sac", tmp_path / "alone", seed=4, steps=150)
     for a, b in zip(runs[1].read("rows"), alone.read("rows"), strict=True):
@@ -246,20 +252,46 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
     [
         ({"preset": "huge"}, "unknown preset"),
         ({"widht": 3}, "did you mean width"),
+        ({"lr": 3}, "unknown hyperparameter 'lr'; did you mean learning_rate, actor_learning_rate, critic_"),
+        ({"xyz": 3}, "unknown hyperparameter 'xyz'; `delayrl train AGENT --help` lists them"),
         ({"batch_size": 0}, "at least 1"),
         ({"batch_size": 2.5}, "whole number"),
         ({"discount": float("nan")}, "number"),
         ({"representation": "lstm"}, "one of"),
         ({"hidden": [8, -1]}, "at least 1"),
         ({"seed": -1}, "seed"),
+        ({"seeds": []}, "a list of different seeds"),
+        ({"seeds": [1, 1]}, "a list of different seeds"),
+        ({"seeds": [0.5]}, "a list of different seeds"),
+        ({"seeds": [0, 1], "seed": 3}, "without seed="),
+        ({"seeds": [0, -1]}, "a seed must be"),
+        ({"seeds": 0}, "seeds must be at least 1"),
         ({"device": "tpu"}, "cpu or gpu"),
         ({"replay_capacity": 5}, "at least"),
+        (
+            {"steps": 99},
+            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_st",
+        ),
+        ({"steps": 100, "update_every": 101, "clone_every": 102}, "the first update is at step 101"),
+        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after, or preset"),
         ({"track": "paper"}, "tensorboard or wandb"),
     ],
 )
 def test_bad_values(values: dict, words: str, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match=words):
         train("vdpo", tmp_path / "run", **values)
+
+
+@pytest.mark.parametrize(
+    ("steps", "every", "fits"), [(100, 1, True), (99, 1, False), (119, 40, False), (120, 40, True)]
+)
+def test_a_run_learns_something(steps: int, every: int, fits: bool) -> None:
+    """Updates are due at multiples of `update_every`, from random_steps on; one is enough."""
+    values = {"steps": steps, "update_every": every, "random_steps": 100}
+    setup, task = resolve("bpql", "Reacher-v5", 3, "small", "corrected", values), make("Reacher-v5", 3, rescale=True)
+    with nullcontext() if fits else pytest.raises(delayrl.DelayRLError, match="nothing would be learned"):
+        check_fit(setup, task)
+    check_fit(resolve("random", "Reacher-v5", 3, "small", "corrected", {"steps": steps}), task)  # never learns
 
 
 def test_unknown_agent() -> None:

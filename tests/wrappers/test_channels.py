@@ -1,5 +1,6 @@
 """The wrappers equal a brute-force account of every message, for every law, rule and channel."""
 
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -269,6 +270,31 @@ def test_vector_streams_and_refusals() -> None:
         DelayedVector(vector(None, "CartPole-v1"), 2)
     with pytest.raises(delayrl.DelayRLError, match="goes around"):
         AugmentedVectorObservation(vector(None, "Pendulum-v1"))  # type: ignore[arg-type]
+
+
+class Tensor:
+    """Stands for an array of PyTorch, which NumPy could read."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        return np.asarray(self.values, dtype)
+
+
+class Tensors(gym.vector.VectorWrapper):
+    def reset(self, **options: Any) -> tuple:
+        obs, info = self.env.reset(**options)
+        return Tensor(obs), info
+
+
+def test_a_vector_takes_numpy_arrays() -> None:
+    env = DelayedVector(Tensors(vector(None, "Pendulum-v1")), 2)
+    with pytest.raises(
+        delayrl.DelayRLError, match=r"NumPy arrays, but the environments give \w+\.Tensor: convert them"
+    ):
+        env.reset(seed=1)
+    assert "torch" not in sys.modules
 
 
 def test_a_vector_asks_for_the_length_of_a_step() -> None:

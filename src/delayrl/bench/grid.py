@@ -8,7 +8,7 @@ import functools
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import product
@@ -22,6 +22,7 @@ from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
+from delayrl.run.configuration import check_names, options
 from delayrl.training.train import check_fit
 
 LISTS = {"agents": list, "tasks": list, "delays": list}
@@ -111,11 +112,16 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
     for number, item in enumerate(products, 1):
         try:
             _check_keys(item, PRODUCT, "a product")
-            cells += _cells(shared | item | {"overrides": _merge(shared["overrides"], item.get("overrides", {}))})
+            own = item.get("overrides", {})
+            cells += _cells(shared | item | {"overrides": _merge(shared["overrides"], own)})
+            _check_overrides(own, item.get("agents", shared.get("agents", [])))
         except DelayRLError as error:
             raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
     if not cells:
         raise DelayRLError("there are no products, so nothing to run")
+    if products:
+        lists = [item.get("agents", shared.get("agents", [])) for item in products]
+        _check_overrides(shared["overrides"], [agent for agents in lists for agent in agents])
     return cells
 
 
@@ -139,6 +145,19 @@ def _merge(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def _check_overrides(overrides: Mapping[str, Any], agents: Sequence[str]) -> None:
+    """Raise DelayRLError for an override of all agents that none of them has."""
+    presets = [preset for agent in agents for preset in find_agent(agent).presets.values()]
+    names = [name for name, value in overrides.items() if not isinstance(value, dict)]
+    check_names(names, *(config for preset in presets for config in preset))
+
+
+def _applicable(overrides: Mapping[str, Any], agent: str) -> dict[str, Any]:
+    """Return those overrides of all agents whose option this agent has."""
+    known = {option.name for preset in find_agent(agent).presets.values() for c in preset for option in options(c)}
+    return {name: value for name, value in overrides.items() if name in known}
+
+
 def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
     """Yield the cells of one product."""
     for key, kind in (("agents", str), ("tasks", str), ("delays", int | float | str)):
@@ -154,7 +173,7 @@ def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
     around = table.get("env_kwargs"), table.get("wrappers", ()), table.get("flatten", False)
     tasks = [str(as_task(env, *around)) for env in table["tasks"]]
     for env, delay, agent in product(tasks, table["delays"], table["agents"]):
-        overrides = json.dumps(shared | table["overrides"].get(agent, {}), default=str)
+        overrides = json.dumps(_applicable(shared, agent) | table["overrides"].get(agent, {}), default=str)
         try:
             setup = _setup(agent, env, delay, table["preset"], table["protocol"], overrides)
         except DelayRLError as error:

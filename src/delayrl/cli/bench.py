@@ -10,7 +10,7 @@ from typing import Any
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
 from delayrl.bench.status import HEAD, closing_lines, duration, line, standing, status, table
-from delayrl.cli.console import StatusLine, print_table
+from delayrl.cli.console import StatusLine, print_table, whole
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell
 from delayrl.training.signals import stop_signal
@@ -38,9 +38,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = run.add_argument
     add("--cells", nargs="+", metavar="ID", help="only these cells")
     add("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
-    add("--workers", type=int, metavar="N", help="cells at a time (default: half of the cores; one with a GPU)")
+    add("--workers", type=whole, metavar="N", help="cells at a time (default: half of the cores; one with a GPU)")
     add("--time-limit", type=seconds, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")
-    add("--tries", type=int, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)")
+    add("--tries", type=whole, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)")
     add("--device", choices=["cpu", "gpu"], help="(default: JAX's choice)")
     add("--sbatch", action="append", metavar="OPTION", help="slurm: e.g. --sbatch=--partition=gpu")
     add("--submit", action="store_true", help="slurm: pass the script to sbatch as well")
@@ -48,7 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--cpus", type=float, help="ray: cores for each cell (default: 1)")
     add("--gpus", type=float, help="ray: GPUs for each cell (default: 0)")
     add = add_command("status", "show progress, speed, time left and failures").add_argument
-    add("--workers", type=int, default=1, metavar="N", help="cells at a time, for the time left (default: 1)")
+    add("--workers", type=whole, default=1, metavar="N", help="cells at a time, for the time left (default: 1)")
     add = add_command("collect", "write the rows of a grid into one SQLite table").add_argument
     add("--out", type=Path, help="the table (default: GRID.sqlite in the folder of the cells)")
     add = add_command("report", "write tables, curves and one HTML page of the results so far").add_argument

@@ -1,26 +1,34 @@
 """What commands share: a parser with errors in one line, tables, and a status line for a terminal or a log."""
 
 import argparse
-import difflib
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, NoReturn
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, near_names
 
 
 class Parser(argparse.ArgumentParser):
     """Parse a command's words. Every error is a DelayRLError."""
 
+    def __init__(self, *values: Any, **options: Any) -> None:
+        super().__init__(*values, **options)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # argparse takes -20,2 and -1e3 for options
+
     def read(self, words: Sequence[str]) -> argparse.Namespace:
-        """Return the values of the options. The error for an unknown one names the nearest."""
-        given, rest = self.parse_known_args(words)
+        """Return the values of the options, whose names may have underscores for hyphens.
+
+        The error for an unknown one names the nearest.
+        """
+        given, rest = self.parse_known_args([hyphenated(word) for word in words])
         if rest:
             unknown = next((word for word in rest if word.startswith("--")), "").split("=")[0]
             options = [name for name in self._option_string_actions if name not in ("-h", "--help")]
-            near = difflib.get_close_matches(unknown, options, n=3, cutoff=0.4)
+            near = near_names(unknown, options)
             hint = f"; did you mean {', '.join(near)}?" if near else ""
             self.error(f"unexpected {' '.join(rest)!r}{hint}")
         return given
@@ -58,6 +66,39 @@ def pair(word: str) -> tuple[str, Any]:
         return name, json.loads(text)
     except ValueError:
         return name, text
+
+
+def hyphenated(word: str) -> str:
+    """Replace the underscores in the name of an option; return any other word, and an option's value, as it is."""
+    name, separator, value = word.partition("=")
+    return name.replace("_", "-") + separator + value if word.startswith("--") else word
+
+
+def whole(text: str) -> int:
+    """Read a whole number, which may be written as 100_000 or 1e5."""
+    with suppress(ValueError):
+        return int(text)
+    with suppress(ValueError):
+        if (number := float(text)).is_integer():
+            return int(number)
+    raise argparse.ArgumentTypeError(f"must be a whole number; got {text!r}")
+
+
+class Numbers(argparse.Action):
+    """Collect numbers that are separated by spaces, by commas, or by both: `32 32` and `32,32`."""
+
+    @staticmethod
+    def of(kind: Callable[[str], Any]) -> dict[str, Any]:
+        """Return the settings of an option that takes several numbers of one kind."""
+
+        def numbers(text: str) -> list[Any]:
+            return [kind(part) for part in text.split(",")]
+
+        return {"action": Numbers, "nargs": "+", "type": numbers}
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Store the numbers of all words in one list."""
+        setattr(namespace, self.dest, [number for word in values for number in word])
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from delayrl.cli.console import add_env_kwargs, add_stored_env, print_table
+from delayrl.cli.console import add_env_kwargs, add_stored_env, print_table, whole
 from delayrl.errors import DelayRLError
 
 
@@ -14,10 +14,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the run folder, and the episodes to play."""
     add = parser.add_argument
     add("run", type=Path, help="the run folder")
-    add("--episodes", type=int, default=10, help="episodes to play (default: 10)")
+    add("--episodes", type=whole, default=10, help="episodes to play (default: 10)")
     add("--delay", metavar="DELAY", help="a delay up to the longest of the training (default: that of the training)")
     add("--sweep", action="store_true", help="play every delay from 0 to the longest, and draw a figure")
-    add("--seed", type=int, default=0, help="seed of the start states (default: 0)")
+    add("--seed", type=whole, default=0, help="seed of the start states (default: 0)")
     add("--json", action="store_true", help="print JSON")
     add_stored_env(parser)
     add_env_kwargs(parser)

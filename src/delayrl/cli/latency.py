@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import print_table
+from delayrl.cli.console import Numbers, print_table, whole
 from delayrl.errors import DelayRLError
 
 
@@ -13,20 +13,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("bundle", type=Path, help="the folder of the bundle")
     add("--period", type=float, metavar="MS", help="the control period (default: the task's step)")
     add("--backend", choices=["numpy", "onnx", "jax"], help="(default: all that are installed)")
-    add("--ages", type=int, nargs="+", metavar="N", help="(default: 5, 25, 50 and the longest)")
-    add("--decisions", type=int, default=2000, metavar="N", help="decisions for each age (default: 2000)")
+    add("--ages", **Numbers.of(whole), metavar="N", help="(default: 5, 25, 50 and the longest)")
+    add("--decisions", type=whole, default=2000, metavar="N", help="decisions for each age (default: 2000)")
 
 
 def run(given: argparse.Namespace) -> None:
     """Time the decisions, and print their quantiles."""
     from delayrl.deploy.bundle import BACKENDS, load_bundle
+    from delayrl.deploy.files import GRAPH
     from delayrl.deploy.latency import available, latency, table
 
     policy = load_bundle(given.bundle)
     period = given.period if given.period is not None else policy.dt and 1000 * policy.dt
     if period is not None and not 0 < period < float("inf"):
         raise DelayRLError(f"--period takes milliseconds above 0; got {period:g}")
-    backends = [given.backend] if given.backend else [name for name in BACKENDS if available(name)]
+    here = [name for name in BACKENDS if available(name) and (name != "onnx" or GRAPH in policy.metadata["files"])]
+    backends = [given.backend] if given.backend else here
     rows = {name: latency(given.bundle, name, decisions=given.decisions, ages=given.ages) for name in backends}
     print_table(*table(rows, period))
     note = f"control period {period:g} ms" if period else "control period unknown: give --period MS"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from delayrl import __version__
 from delayrl.cli.console import Parser
 from delayrl.errors import DelayRLError, DelayWarning
 
@@ -51,6 +52,7 @@ def _show_warning(message: Warning | str, category: type[Warning], filename: str
 
 def _run(arguments: list[str]) -> None:
     parser = Parser(prog="delayrl", description="Reinforcement learning when observations arrive late.")
+    parser.add_argument("--version", action="version", version=f"delayrl {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     parsers = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     if not arguments or arguments[0] not in parsers:

@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from delayrl.cli.console import add_env_kwargs, add_wrappers
+from delayrl.cli.console import add_env_kwargs, add_wrappers, whole
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.measure.log import Estimated, from_log, plot
@@ -29,10 +29,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a Gymnasium task, or module:function that makes one; or a CSV or Parquet file",
     )
     add("--json", action="store_true", help="print one JSON object")
-    add("--seed", type=int, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
+    add("--seed", type=whole, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
     add("--longest", metavar="N|TIME", help="the longest delay to look for: steps (200), or time (100 rows of the log)")
     environment = parser.add_argument_group("environment")
-    environment.add_argument("--episodes", type=int, help="episodes to play (default: 8)")
+    environment.add_argument("--episodes", type=whole, help="episodes to play (default: 8)")
     add_env_kwargs(environment)
     add_wrappers(environment)
     add = parser.add_argument_group("log").add_argument

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from delayrl.cli import agents
-from delayrl.cli.console import Parser, add_env_kwargs, add_wrappers
+from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_wrappers, whole
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import Run
 
@@ -35,14 +35,14 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     add_wrappers(parser)
     add("--delay", default="0", metavar="DELAY", help="steps, or e.g. 80ms, uniform:1:5 (default: 0)")
     add("--preset", choices=list(agent.presets), default="paper", help="the defaults of the options (default: paper)")
-    add("--seed", type=int, default=0, metavar="K", help="fixes everything (default: 0)")
-    add("--seeds", type=int, default=1, metavar="N", help="train seeds K..K+N-1 in lockstep (default: 1)")
+    add("--seed", type=whole, default=0, metavar="K", help="fixes everything (default: 0)")
+    add("--seeds", type=whole, default=1, metavar="N", help="train seeds K..K+N-1 in lockstep (default: 1)")
     add("--out", type=Path, metavar="DIR", help="the run folder (default: below runs/)")
     add("--device", choices=["cpu", "gpu"], help="where to compute (default: JAX's choice)")
     add("--overwrite", action="store_true", help="start afresh where a run exists")
     add("--protocol", choices=["corrected", "official"], default="corrected", help="official: like the released code")
     add("--track", choices=["tensorboard", "wandb"], help="log to this service as well")
-    add("--threads", type=int, default=1, help="threads that step the environments (default: 1)")
+    add("--threads", type=whole, default=1, help="threads that step the environments (default: 1)")
     add("--quiet", action="store_true", help="show no progress bar and no notes")
     base = agent.presets[preset]
     _add_group(parser, f"schedule (preset {preset})", base.schedule)
@@ -54,15 +54,19 @@ def _add_group(parser: Parser, title: str, config: Any) -> None:
 
     group = parser.add_argument_group(title)
     for option in options(config):
-        settings: dict[str, Any] = {"type": option.kind, "metavar": "VALUE"}
+        settings: dict[str, Any] = {"type": _reader(option.kind), "metavar": "VALUE"}
         default = option.default
         if get_origin(option.kind) is Literal:
             settings = {"choices": get_args(option.kind)}
         elif get_origin(option.kind) is tuple:
-            settings |= {"type": get_args(option.kind)[0], "nargs": "+"}
+            settings |= Numbers.of(_reader(get_args(option.kind)[0]))
             default = " ".join(map(str, default))
         name = f"--{option.name.replace('_', '-')}"
         group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+
+
+def _reader(kind: Any) -> Any:
+    return whole if kind is int else kind
 
 
 def run(given: argparse.Namespace) -> None:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import add_env_kwargs, add_stored_env
+from delayrl.cli.console import add_env_kwargs, add_stored_env, whole
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -12,7 +12,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("run", type=Path, help="the run folder")
     add("--out", type=Path, required=True, help="an .mp4 or .gif file")
     add("--delay", metavar="DELAY", help="a delay up to the longest of the training (default: that of the training)")
-    add("--seed", type=int, default=0, help="seed of the start state (default: 0)")
+    add("--seed", type=whole, default=0, help="seed of the start state (default: 0)")
+    add("--camera", metavar="NAME", help="a camera of the MuJoCo model (default: track, or one that follows the robot)")
+    add("--compare", type=Path, metavar="RUN2", help="show a run on the same task beside it, from the same start state")
     add_stored_env(parser)
     add_env_kwargs(parser)
 
@@ -22,5 +24,6 @@ def run(given: argparse.Namespace) -> None:
     from delayrl.play.video import watch
 
     task = {"env": given.env, "env_kwargs": dict(given.env_kwargs)}
-    frames, total = watch(given.run, given.out, given.delay, given.seed, **task)
-    print(f"{given.out}: {frames} frames, return {total:.1f}")
+    moments = watch(given.run, given.out, given.delay, given.seed, given.camera, given.compare, **task)
+    results = (f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
+    print(f"{given.out}: {'; beside it '.join(results)}")

@@ -1,5 +1,7 @@
 """Export a run folder as a bundle. Apart from the backend `jax`, only this module of the package needs JAX."""
 
+import warnings
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from delayrl.deploy.backends.onnx_policy import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike
+from delayrl.errors import DelayWarning
 from delayrl.play.policy import Policy, restored, task_of
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import Run
@@ -41,11 +44,19 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False, env: Ta
 
 
 def bundle_files(policy: Policy, metadata: dict[str, Any]) -> dict[str, bytes]:
-    """Return the files of a bundle: the policy's weights and graph, and a bundle.json of `metadata` and the network."""
+    """Return the files of a bundle: the policy's weights and graph, and a bundle.json of `metadata` and the network.
+
+    Without the package `onnx` the graph is left out, with a DelayWarning that says so.
+    """
     network, arrays = network_of(policy)
     metadata = metadata | {"policy": network.document()}
     weights = safetensors.numpy.save(dict(sorted(arrays.items())))
-    files = {WEIGHTS: weights, GRAPH: onnx_graph(network, arrays, metadata)}
+    files = {WEIGHTS: weights}
+    if find_spec("onnx") is None:
+        line = f"the bundle has no {GRAPH}, because the package onnx is not installed: pip install 'delayrl[deploy]', "
+        warnings.warn(line + "then export again with --force", DelayWarning, stacklevel=2)
+    else:
+        files[GRAPH] = onnx_graph(network, arrays, metadata)
     check_files("the new bundle", metadata, files)
     return seal(metadata, files)
 

@@ -47,9 +47,14 @@ def read_signals(
     table = _Table(path)
     stamps = table.find(time, ("time", "timestamp", "t"), "time stamps", "--time", needed=True)
     groups = {}
+    others = [name for name in table.names if name != stamps]
+    words = {word.lower() for word in (*(commands or ()), *(observations or ()))}
+    named = words & {name.lower() for name in others}  # whole names, which are no prefixes of other columns
     for what, given in (("commands", commands), ("observations", observations)):
         starts = tuple(given or PREFIXES[what])
-        names = [n for n in table.names if n != stamps and n.lower().startswith(tuple(s.lower() for s in starts))]
+        own = {word.lower() for word in given or ()} & named
+        prefixes = tuple(word.lower() for word in starts if word.lower() not in own)
+        names = [n for n in others if n.lower() in own or (n.lower() not in named and n.lower().startswith(prefixes))]
         if not names:
             hint = f"none begins with {' or '.join(starts)}; name them with --{what}. It has {_few(table.names)}"
             raise DelayRLError(f"{path} has no column for {what}: {hint}")

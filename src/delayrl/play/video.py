@@ -1,74 +1,146 @@
-"""Render an episode to a file, without a screen."""
+"""Render episodes of trained policies to a file, without a screen."""
 
 import os
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-import numpy as np
+import imageio
+from tqdm import tqdm
 
+from delayrl.envs import make
+from delayrl.envs.task import TaskLike
 from delayrl.errors import DelayRLError, first_line
+from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
+from delayrl.play.picture import Picture, aim, beside, caption, close, render
+from delayrl.play.policy import Policy, load, task_of
+from delayrl.run.folder import Run
+from delayrl.wrappers.single import name_of
 
-if TYPE_CHECKING:
-    from delayrl.envs.task import TaskLike
+FASTEST = {".mp4": 60, ".gif": 25}
+"""Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""
+
+
+class Moment(NamedTuple):
+    """An episode up to one of its steps."""
+
+    picture: Picture
+    step: int
+    age: int  # of the observation that the policy is shown, in steps
+    total: float  # the return so far
+    over: bool
 
 
 def watch(
-    run: Path,
-    out: Path,
+    run: str | Path,
+    out: str | Path,
     delay: int | str | None = None,
     seed: int = 0,
+    camera: str | None = None,
+    compare: str | Path | None = None,
     *,
-    env: "TaskLike | None" = None,
+    env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-) -> tuple[int, float]:
-    """Play one episode of a run's policy, and write it to an .mp4 or .gif file. Returns the frames and the return.
+) -> list[Moment]:
+    """Play an episode of a run's policy, and write it to an .mp4 or .gif file.
 
-    Raises DelayRLError for another kind of file, no run, a delay longer than in training, or no way to render.
+    Step, age and return are written into the picture. The camera follows a robot that moves away.
+
+    Args:
+        run: the run folder.
+        out: the file.
+        delay: any delay that the policy can serve; None for the one it was trained for.
+        seed: of the start state.
+        camera: a camera of the MuJoCo model; None for `track`, or one that follows as it does.
+        compare: a second run on the same task, shown beside the first, from the same start state.
+        env: what makes the environment, as `load`.
+        env_kwargs: keyword arguments of the environment that replace or complete the run's.
+
+    Returns:
+        The last moment of the run's episode, and of that of `compare`.
+
+    Raises:
+        DelayRLError: another kind of file, no run, runs of two tasks, a delay longer than in training, no such camera,
+            no way to render.
     """
-    if out.suffix not in (".mp4", ".gif"):
+    out = Path(out)
+    if out.suffix not in FASTEST:
         raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")
-    from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
-
     check_seed(seed)
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
-    import imageio
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # what pygame draws with
+    paths = [Path(run)] if compare is None else [Path(run), Path(compare)]
+    configs = [Run(path).config for path in paths]
+    if configs[0]["env"] != configs[-1]["env"]:
+        raise DelayRLError(f"--compare takes a run on {configs[0]['env']}; got one on {configs[-1]['env']}")
+    with ExitStack() as stack:
+        titles, episodes = [], []
+        for path, config in zip(paths, configs, strict=True):
+            task = task_of(path, env, env_kwargs)
+            policy = load(path, task)
+            served = servable(task, config["delay"] if delay is None else delay, policy.spec)
+            played = make(task, served, render_mode="rgb_array")
+            stack.callback(close, played)
+            rate = float(played.metadata.get("render_fps") or 30)
+            stride = max(1, round(rate / FASTEST[out.suffix]))
+            titles.append(f"{config['agent']}, delay {served.label()}")
+            episodes.append(_episode(played, policy, reset_seed(seed, HELD_OUT, 0), camera, stride))
+        moments = _together(episodes)
+        last = next(moments)  # before there is a file, because the first frame fails where nothing can be rendered
+        moments = chain([last], moments)
+        with _video(out, rate / stride) as add:
+            for last in tqdm(moments, unit="frame", leave=False, disable=None):
+                add(beside([caption(m.picture, title, _words(m)) for title, m in zip(titles, last, strict=True)]))
+    return last
 
-    from delayrl.envs import make
-    from delayrl.play.policy import load, task_of
-    from delayrl.run.folder import Run
 
-    config = Run(run).config
-    task = task_of(run, env, env_kwargs)
-    policy = load(run, task)
-    served = servable(task, config["delay"] if delay is None else delay, policy.spec)
-    played = make(task, served, render_mode="rgb_array")
-    obs, info = played.reset(seed=reset_seed(seed, HELD_OUT, 0))
-    frames, total, done = [], 0.0, False
+def _episode(env: Any, policy: Policy, seed: int, camera: str | None, stride: int) -> Iterator[Moment]:
+    """Play an episode. Yields every `stride`-th moment of it, and the last."""
+    step, total, over = 0, 0.0, False
     try:
-        while not done:
-            frames.append(np.asarray(played.render()))
-            obs, reward, terminated, truncated, info = played.step(policy.act(obs, info))
-            total += float(reward)
-            done = terminated or truncated
+        obs, info = env.reset(seed=seed)
+        aim(env, camera)
+        yield Moment(render(env), step, info["age"], total, over)
+        while not over:
+            obs, reward, terminated, truncated, info = env.step(policy.act(obs, info))
+            step, total, over = step + 1, total + float(reward), terminated or truncated
+            if over or step % stride == 0:
+                yield Moment(render(env), step, info["age"], total, over)
     except DelayRLError:
         raise
     except Exception as error:  # a renderer may raise anything
-        raise DelayRLError(
-            f"{task} cannot be rendered here: {first_line(error)}; Linux without a screen needs EGL (package libegl1)"
-        ) from error
-    rate = float(played.metadata.get("render_fps") or 30)
+        mujoco = hasattr(env.unwrapped, "mujoco_renderer")
+        hint = "; Linux without a screen needs EGL (package libegl1)" if mujoco else ""
+        raise DelayRLError(f"{name_of(env)} cannot be rendered here: {first_line(error)}{hint}") from error
+
+
+def _together(episodes: Sequence[Iterator[Moment]]) -> Iterator[list[Moment]]:
+    """Advance several episodes at once until all are over. Of one that is over, the last moment stays."""
+    moments = [next(episode) for episode in episodes]
+    yield moments
+    while not all(moment.over for moment in moments):
+        moments = [old if old.over else next(episode) for old, episode in zip(moments, episodes, strict=True)]
+        yield moments
+
+
+def _words(moment: Moment) -> list[str]:
+    step = f"ended at {moment.step:,}" if moment.over else f"step {moment.step:,}"
+    return [step, f"age {moment.age}", f"return {moment.total:,.1f}"]
+
+
+@contextmanager
+def _video(out: Path, rate: float) -> Iterator[Callable[[Any], None]]:
+    """Open a video file, and yield the function that adds a frame. Raises DelayRLError if it cannot be written."""
+    options = {"fps": rate, "macro_block_size": None} if out.suffix == ".mp4" else {"duration": 1000 / rate, "loop": 0}
     try:
-        if out.suffix == ".gif":  # viewers show at most 50 frames per second
-            stride = max(1, round(rate / 25))
-            imageio.mimsave(out, frames[::stride], duration=1000 * stride / rate, loop=0)
-        else:
-            with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
-                warnings.simplefilter("ignore", RuntimeWarning)
-                imageio.mimsave(out, frames, fps=rate, macro_block_size=None)
+        with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
+            warnings.simplefilter("ignore", RuntimeWarning)
+            with imageio.get_writer(out, **options) as writer:
+                yield writer.append_data
     except OSError as error:
         raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
-    return len(frames), total

@@ -1,12 +1,11 @@
 """Configuration: frozen dataclasses are flattened to named options, overridden by name, and rebuilt from JSON."""
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, near_names
 
 OLDER: Mapping[str, Any] = {
     "entropy_unit": "scaled",
@@ -89,8 +88,8 @@ def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) 
     known = [option.name for config in configs for option in options(config)] + list(also)
     for name in values:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-            hint = f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(known)}"
+            near = near_names(name, known)
+            hint = f"did you mean {', '.join(near)}?" if near else "`delayrl train AGENT --help` lists them"
             raise DelayRLError(f"unknown hyperparameter {name!r}; {hint}")
 
 

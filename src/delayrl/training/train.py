@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from tqdm import tqdm
 
 from delayrl.agents.base import PRODUCTS, State, template
-from delayrl.delays import DelayLike
-from delayrl.envs import make
+from delayrl.delays import DelayLike, in_other_unit
+from delayrl.envs import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
@@ -41,7 +41,7 @@ def train(
     flatten: bool = False,
     preset: str = "paper",
     seed: int = 0,
-    seeds: int = 1,
+    seeds: int | Sequence[int] = 1,
     out: str | Path | None = None,
     device: str | None = None,
     overwrite: bool = False,
@@ -63,7 +63,7 @@ def train(
         flatten: as `make`.
         preset: "paper" or "small": which hyperparameters to start from.
         seed: fixes everything: environments, networks, sampling.
-        seeds: trains the seeds seed .. seed + seeds - 1 in lockstep.
+        seeds: trains the seeds seed .. seed + seeds - 1 in lockstep, or those of a list.
         out: the run folder; with several seeds the folder of their run folders.
         device: "cpu" or "gpu"; None leaves the choice to JAX.
         overwrite: start afresh where a run exists.
@@ -74,25 +74,22 @@ def train(
         **values: any hyperparameter or schedule option by name.
 
     Returns:
-        The run, or the list of runs if `seeds` > 1.
+        The run, or the list of runs if `seeds` is above 1 or a list.
 
     Raises:
         DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
     """
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
-    for name, count in (("seeds", seeds), ("threads", threads)):
-        if count < 1:
-            raise DelayRLError(f"{name} must be at least 1; got {count}")
-    check_seed(seed)
-    check_seed(seed + seeds - 1)
-    numbers = list(range(seed, seed + seeds))
+    if threads < 1:
+        raise DelayRLError(f"threads must be at least 1; got {threads}")
+    numbers = seed_numbers(seed, seeds)
     runs = run_folders(setup.condition, numbers, out)
     observed = setup.delay.observed()
     envs = [make(setup.task, observed, rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
     if device != "gpu":
-        keep_buffers(setup.agent, spec, seeds)  # before JAX looks for its devices
+        keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     precision = PRODUCTS[setup.schedule.precision]
     with ThreadPoolExecutor(threads) as pool, on_device(device), jax.default_matmul_precision(precision):
         privileged, rules = setup.agent.privileged, setup.protocol
@@ -105,8 +102,26 @@ def train(
             if progress:
                 tqdm.write(line, file=sys.stderr)
 
+        if setup.delay.maximum and (seconds := seconds_of(envs[0])):
+            note(f"delay: {in_other_unit(delay, setup.delay, seconds)}")
         run(group, start(group, actors, overwrite, note), note, progress=progress, track=track)
     return runs[0] if seeds == 1 else runs
+
+
+def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
+    """Return the seeds to train: `seeds` many from `seed` on, or those listed. Raises DelayRLError for bad ones."""
+    if isinstance(seeds, int):
+        if seeds < 1:
+            raise DelayRLError(f"seeds must be at least 1; got {seeds}")
+        numbers = list(range(seed, seed + seeds))
+    else:
+        numbers = list(seeds)
+        different = len(set(numbers)) == len(numbers) and all(isinstance(number, int) for number in numbers)
+        if seed or not numbers or not different:
+            raise DelayRLError(f"seeds is a number, or a list of different seeds without seed=; got {seeds!r}")
+    check_seed(min(numbers))
+    check_seed(max(numbers))
+    return numbers
 
 
 def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[Run]:
@@ -128,6 +143,13 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
+    first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
+    if first > schedule.steps:
+        start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
+        raise DelayRLError(
+            f"nothing would be learned: the first update is at step {first:,}, and the run ends at step "
+            f"{schedule.steps:,}; give more steps, {start}, or preset small"
+        )
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")

@@ -15,6 +15,8 @@ from delayrl.wrappers.transit import Fill, Transit
 class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     """Delay every environment of a vector, each with random numbers of its own.
 
+    It computes with NumPy on the CPU. Vectors that give arrays of PyTorch or JAX are refused.
+
     Environment i of a vector that is reset with seed k equals, number for number, a single one that is reset with
     k + i. What `Delayed` adds to `info` has a leading axis for the environments. In autoreset mode "same step",
     `info["final_obs"]` and `info["final_info"]` hold what the agent saw at the end of an episode.
@@ -25,8 +27,8 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         step_seconds: the length of a step, for delays given as times; None to ask the environments.
 
     Raises:
-        DelayRLError: as `Delayed`; and for a delay of rewards, because a termination on its way would hold up the
-            other environments.
+        DelayRLError: as `Delayed`; for a delay of rewards, because a termination on its way would hold up the other
+            environments; and, at the first reset, for observations that are not NumPy's.
     """
 
     def __init__(
@@ -65,6 +67,12 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         """Start all episodes, or those of `options["reset_mask"]`."""
         mask = self._every if options is None else options.get("reset_mask", self._every)
         truth, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        if not isinstance(truth, np.ndarray):
+            kind = f"{type(truth).__module__}.{type(truth).__name__}"
+            raise DelayRLError(
+                f"DelayedVector takes and gives NumPy arrays, but the environments give {kind}: convert them inside, "
+                "e.g. with gymnasium.wrappers.vector.ArrayConversion"
+            )
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         for i in np.flatnonzero(mask):
             self._transits[i].reset(truth[i], seeds[i] if seeds is not None else None)

@@ -1,6 +1,7 @@
 """The ROS 2 example, on a fake rclpy that delivers messages and fires timers by hand."""
 
 import importlib.util
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -141,6 +142,13 @@ def test_parameters_left_out_are_the_policys_own(example: Any) -> None:
         **{"policy": "", "on_overrun": "raise"},
         **dict.fromkeys(("action_delay", "dt", "idle")),
     }
+
+
+def test_without_ros_is_one_line() -> None:
+    done = subprocess.run([sys.executable, EXAMPLE], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("delayed_policy: needs ROS 2 and its Python package rclpy: source ")
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_message_of_another_robot_is_no_end(example: Any) -> None:
