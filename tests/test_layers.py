@@ -114,7 +114,7 @@ def test_sac_is_read_in_one_sitting() -> None:
     path = "run/configuration run/condition agents/registry agents/base agents/sac core/protocol core/types core/views "
     path += "core/replay core/networks core/objectives training/train training/state training/actor training/learner "
     path += "training/loop"
-    assert sum(len((SOURCE / f"{name}.py").read_text().splitlines()) for name in path.split()) <= 1950
+    assert sum(len((SOURCE / f"{name}.py").read_text().splitlines()) for name in path.split()) <= 2000
 
 
 def test_light_modules_import_no_jax() -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from delayrl.envs.making import name_of
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import name_of
 
 Picture = NDArray[np.uint8]
 """[height, width, 3]"""

@@ -13,13 +13,13 @@ import imageio
 from tqdm import tqdm
 
 from delayrl.envs import make
+from delayrl.envs.making import name_of
 from delayrl.envs.task import TaskLike
 from delayrl.errors import DelayRLError, first_line
 from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of
 from delayrl.run.folder import Run
-from delayrl.wrappers.single import name_of
 
 FASTEST = {".mp4": 60, ".gif": 25}
 """Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""

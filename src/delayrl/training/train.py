@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from delayrl.agents.base import PRODUCTS, State, template
 from delayrl.delays import DelayLike, in_other_unit
-from delayrl.envs import make, seconds_of
+from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
