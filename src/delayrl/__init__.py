@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from delayrl.errors import DelayRLError as DelayRLError
     from delayrl.play.policy import Policy as Policy
     from delayrl.play.policy import load as load
+    from delayrl.training.further import go_on as go_on
     from delayrl.training.train import train as train
     from delayrl.wrappers import AugmentedObservation as AugmentedObservation
     from delayrl.wrappers import AugmentedVectorObservation as AugmentedVectorObservation
@@ -38,6 +39,7 @@ _HOME = {
     "Policy": "play.policy",
     "load": "play.policy",
     "make": "envs",
+    "go_on": "training.further",
     "train": "training.train",
 }
 __all__ = sorted(_HOME)

@@ -132,18 +132,19 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
 
     monkeypatch.setattr(Actor, "step", dying)
     with pytest.raises(KilledError):
-        train(agent, tmp_path / "cut", protocol=protocol)
+        train(agent, tmp_path / "cut", protocol=protocol, slim=True)
     monkeypatch.setattr(Actor, "step", step)
     run = Run(tmp_path / "cut")
     assert run.latest().step == at // 100 * 100
     run.append("rows", [{"step": 299, "policy": "agent", "return": 0.0}])  # made after the checkpoint
     with open(run.path / "rows.jsonl", "a") as file:
         file.write('{"step": 299, "pol')
-    resumed = train(agent, tmp_path / "cut", protocol=protocol)
+    resumed = train(agent, tmp_path / "cut", protocol=protocol, slim=True)
     assert resumed.read("rows") == whole.read("rows")
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
     assert not (run.path / "replay").exists()
+    assert len(list((whole.path / "checkpoints").iterdir())) == 1
 
 
 @pytest.mark.parametrize(

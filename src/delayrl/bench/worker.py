@@ -64,7 +64,7 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
         note(folder, "begun", pid=os.getpid(), step=step, versions=versions())
         condition = {name: cell[name] for name in ("agent", "env", "delay", "preset", "protocol")} | cell["overrides"]
         out = folder if len(seeds) > 1 else seed_folders(folder, seeds)[0]
-        train(**condition, seed=seeds[0], seeds=len(seeds), out=out, device=device, progress=False)
+        train(**condition, seed=seeds[0], seeds=len(seeds), out=out, device=device, progress=False, slim=True)
         note(folder, "done")
         return Outcome("done", "")
     except StoppedError as error:

@@ -1,4 +1,4 @@
-"""`delayrl train AGENT`: train an agent, or resume a run."""
+"""`delayrl train AGENT`: train an agent, or resume a run. `delayrl train RUN`: train a run further."""
 
 import argparse
 from collections.abc import Sequence
@@ -6,21 +6,25 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from delayrl.cli import agents
-from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_wrappers, whole
+from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored_env, add_wrappers, whole
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import Run
 
 
 def add_options(parser: Parser, words: Sequence[str]) -> None:
     """Add the options of the agent that comes first in `words`, with the defaults of their preset."""
-    from delayrl.agents.registry import find_agent
+    from delayrl.agents.registry import AGENTS, find_agent
 
     if not words or words[0].startswith("-"):
         if {"-h", "--help"} & set(words):
-            print("usage: delayrl train AGENT --env ID --delay N [options]; `delayrl train AGENT --help` shows them\n")
+            print("usage: delayrl train AGENT --env ID --delay N [options]; `delayrl train AGENT --help` shows them")
+            print("       delayrl train RUN --steps N; trains the run in this folder further\n")
             agents.run()
             parser.exit()
         raise DelayRLError("name the agent first, e.g. `delayrl train vdpo`; `delayrl agents` lists them")
+    if words[0] not in AGENTS and Path(words[0]).is_dir():
+        _add_options_of_a_run(parser, words[0])
+        return
     agent = find_agent(words[0])
     parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary
     parser.allow_abbrev = False
@@ -38,15 +42,32 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     add("--seed", type=whole, default=0, metavar="K", help="fixes everything (default: 0)")
     add("--seeds", type=whole, default=1, metavar="N", help="train seeds K..K+N-1 in lockstep (default: 1)")
     add("--out", type=Path, metavar="DIR", help="the run folder (default: below runs/)")
-    add("--device", choices=["cpu", "gpu"], help="where to compute (default: JAX's choice)")
+    add("--from", type=Path, dest="start_from", metavar="RUN", help="begin with the networks of this run that fit")
     add("--overwrite", action="store_true", help="start afresh where a run exists")
     add("--protocol", choices=["corrected", "official"], default="corrected", help="official: like the released code")
-    add("--track", choices=["tensorboard", "wandb"], help="log to this service as well")
-    add("--threads", type=whole, default=1, help="threads that step the environments (default: 1)")
-    add("--quiet", action="store_true", help="show no progress bar and no notes")
+    _add_ways(parser)
     base = agent.presets[preset]
     _add_group(parser, f"schedule (preset {preset})", base.schedule)
     _add_group(parser, f"hyperparameters (preset {preset})", base.agent)
+
+
+def _add_options_of_a_run(parser: Parser, folder: str) -> None:
+    parser.prog, parser.description = f"delayrl train {folder}", "Train a run further, with its own options."
+    parser.add_argument("run", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--steps", type=whole, required=True, help="the new number of steps, from the run's beginning")
+    add_stored_env(parser)
+    add_env_kwargs(parser)
+    _add_ways(parser)
+
+
+def _add_ways(parser: Parser) -> None:
+    """Add the options that do not change what is learned."""
+    add = parser.add_argument
+    add("--device", choices=["cpu", "gpu"], help="where to compute (default: JAX's choice)")
+    add("--track", choices=["tensorboard", "wandb"], help="log to this service as well")
+    add("--threads", type=whole, default=1, help="threads that step the environments (default: 1)")
+    add("--slim", action="store_true", help="delete the replay at the end: the run cannot be trained further then")
+    add("--quiet", action="store_true", help="show no progress bar and no notes")
 
 
 def _add_group(parser: Parser, title: str, config: Any) -> None:
@@ -71,10 +92,11 @@ def _reader(kind: Any) -> Any:
 
 def run(given: argparse.Namespace) -> None:
     """Train, and print the results of each run."""
+    from delayrl.training.further import go_on
     from delayrl.training.train import train
 
     values = vars(given) | {"env_kwargs": dict(given.env_kwargs)}
-    runs = train(progress=not values.pop("quiet"), **values)
+    runs = (go_on if "run" in values else train)(progress=not values.pop("quiet"), **values)
     for result in runs if isinstance(runs, list) else [runs]:
         _print_summary(result)
 

@@ -26,6 +26,11 @@ class Checkpoint:
     files: dict[str, str]  # checksums of its own files
     pieces: dict[str, str]  # checksums of the files in replay/ that it needs
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether it holds what training further takes, besides the networks."""
+        return "loop.safetensors" in self.files
+
     def arrays(self, name: str) -> "Arrays":
         """Read one of its files: "agent" or "loop"."""
         from delayrl.run.arrays import load_arrays  # NumPy only where arrays are read: `bench status` starts faster

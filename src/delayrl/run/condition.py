@@ -83,6 +83,7 @@ class Setup:
     schedule: Schedule
     delay: Delay
     protocol: Protocol
+    origin: Mapping[str, Any] = field(default_factory=dict)  # what training began from, if not from nothing
 
     @property
     def config(self) -> dict[str, Any]:
@@ -91,7 +92,8 @@ class Setup:
         options = {"hyperparameters": values_of(self.agent), "schedule": values_of(self.schedule)}
         rules = {f.name: value for f in fields(Protocol) if (value := getattr(self.protocol, f.name)) != f.default}
         habits = {name: value for name, value in rules.items() if name not in ("name", "overrides")}
-        return names | {"privileged": self.agent.privileged} | options | ({"habits": habits} if habits else {})
+        origin = {"origin": dict(self.origin)} if self.origin else {}
+        return names | {"privileged": self.agent.privileged} | options | ({"habits": habits} if habits else {}) | origin
 
     def learnable(self, spec: Spec) -> Learnable:
         """Return which steps of an episode can be sampled under the protocol."""
@@ -113,7 +115,7 @@ class Setup:
     @property
     def configuration(self) -> str:
         """Return a hash of all options. With their other columns, it tells rows what was trained, but for the seed."""
-        options = ("hyperparameters", "schedule", "habits")
+        options = ("hyperparameters", "schedule", "habits", "origin")
         return _digest({name: value for name, value in self._decisive.items() if name in options})
 
     @property

@@ -6,7 +6,7 @@ rows.jsonl          one row for each evaluation episode
 metrics.jsonl       losses and speed
 curve.png           return against steps
 checkpoints/STEP/   agent.safetensors, loop.safetensors, manifest.json (checksums); the last two are kept
-replay/             the trajectory in pieces, each written once; deleted when the run is complete
+replay/             the trajectory in pieces, each written once; a run with --slim deletes it when it is complete
 ```
 """
 
@@ -95,6 +95,13 @@ class Run:
         except (ValueError, RecursionError) as error:
             raise DelayRLError(f"{file} is damaged: {error}") from error
 
+    def extend(self, config: Mapping[str, Any]) -> None:
+        """Replace the configuration by one of a longer run, and its hash in all rows."""
+        rows = [row | {"configuration": config["configuration"]} for row in self.read("rows")]
+        with disk_errors(self.path):
+            write_file(self.path / "rows.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
+        self.create(config)
+
     def rewind(self, step: int) -> None:
         """Delete rows and checkpoints of later steps than `step`: the resumed run makes them again."""
         with disk_errors(self.path):
@@ -143,10 +150,13 @@ class Run:
                     _delete_checkpoint(final)
         self._drop_checkpoints(2)
 
-    def finish(self) -> None:
-        """Delete what only a run that goes on needs: the older checkpoint and the replay."""
+    def finish(self, *, slim: bool) -> None:
+        """Delete the older checkpoint and, of a `slim` run, what training further takes: the replay."""
         self._drop_checkpoints(1)
-        shutil.rmtree(self.path / "replay", ignore_errors=True)
+        if slim:
+            shutil.rmtree(self.path / "replay", ignore_errors=True)
+        else:
+            self.drop_pieces()
 
     def save_piece(self, name: str, arrays: Arrays) -> str:
         """Write one piece of the replay. Returns its checksum."""

@@ -1,13 +1,16 @@
-"""Keep large update buffers resident between steps (docs/performance.md)."""
+"""Where and how the process computes: its device, and large update buffers that stay resident (docs/performance.md)."""
 
 import ctypes
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import jax
 
 from delayrl.agents.base import Agent
 from delayrl.core.types import Spec
+from delayrl.errors import DelayRLError
 from delayrl.training.products import follow, traced_updates
 
 LARGE = 50 * 2**20
@@ -46,3 +49,20 @@ def product_bytes(agent: Agent, spec: Spec) -> list[int]:
     programs = [program for _, program in traced_updates(agent, spec)]
     results = [[x.aval for product in follow(program)[0] for x in product.equation.outvars] for program in programs]
     return [sum(x.size * x.dtype.itemsize for x in of_phase) for of_phase in results]
+
+
+@contextmanager
+def on_device(name: str | None) -> Iterator[None]:
+    """Run on "cpu" or "gpu"; None leaves the choice to JAX."""
+    if name is None:
+        yield
+        return
+    if name not in ("cpu", "gpu"):
+        raise DelayRLError(f"device must be cpu or gpu; got {name!r}")
+    try:
+        device = jax.devices(name)[0]
+    except RuntimeError as error:
+        hint = "`pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu"
+        raise DelayRLError(f"JAX finds no {name}; {hint}") from error
+    with jax.default_device(device):
+        yield

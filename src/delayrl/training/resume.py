@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -55,15 +56,66 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     if not checkpoints:
         for run in runs:
             run.rewind(-1)
-        return state
+        return _from_source(group, state, note) if group.source else state
     newest = checkpoints[0]
-    note(f"{'already complete' if newest.complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
+    complete = newest.step >= group.setup.schedule.steps
+    note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
     state = restore(group, state, checkpoints)
     for run in runs:
         run.rewind(newest.step)
-        if newest.complete:
-            run.finish()
+        if complete:
+            run.finish(slim=not newest.can_go_on)
     return state
+
+
+def source_of(path: Path) -> tuple[dict[str, Any], Checkpoint]:
+    """Return what the configuration says of a run whose networks another one begins with, and its newest checkpoint."""
+    run = Run(path)
+    checkpoint, names = run.latest(), ("agent", "env", "delay", "seed", "configuration")
+    described = {name: run.config[name] for name in names if name in run.config}
+    return described | {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}, checkpoint
+
+
+def _from_source(group: Group, state: TrainState, note: Callable[[str], None]) -> TrainState:
+    """Return a fresh state with the networks of another run, as far as they fit. Raises DelayRLError if none does."""
+    assert group.source is not None
+    agent, arrays = state.learner.agent, group.source.arrays("agent")
+    fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
+    arrays |= {f"reference.{name}": array for name, array in arrays.items()}  # a reference is an agent of its own
+    taken, left = fitting(fresh, arrays)
+    if not taken:
+        raise DelayRLError(
+            f"{group.source.path.parents[1]} has no network that fits: {', '.join(left)} have other sizes"
+        )
+    note(f"taken over: {', '.join(taken)}; new: {', '.join(left) or 'no network'}, and the optimisers")
+    names = [name for name in fresh if "opt_state" not in name and part_of(name) in taken]
+
+    def filled(leaf: Any, name: str) -> Any:
+        return jnp.broadcast_to(arrays[name], leaf.shape) if name in names else leaf
+
+    leaves, form = jax.tree.flatten(agent)
+    agent = jax.tree.unflatten(form, [filled(leaf, name) for leaf, name in zip(leaves, fresh, strict=True)])
+    return replace(state, learner=state.learner._replace(agent=agent))
+
+
+def fitting(fresh: Arrays, stored: Arrays) -> tuple[list[str], list[str]]:
+    """Return the parts of an agent's state that stored arrays can fill, and those that they cannot.
+
+    A part is a network or another piece that is of use only whole. Optimisers are never taken over.
+    """
+    parts: dict[str, bool] = {}
+    for name, leaf in fresh.items():
+        if "opt_state" not in name:
+            fits = name in stored and stored[name].shape == leaf.shape
+            parts[part_of(name)] = parts.get(part_of(name), True) and fits
+    return [name for name, fits in parts.items() if fits], [name for name, fits in parts.items() if not fits]
+
+
+def part_of(leaf: str) -> str:
+    """Return the part that a leaf is in: "reference.critic" of "reference.critic.0.1.w"."""
+    names = leaf.split(".")
+    first = next((i for i, name in enumerate(names) if name.isdigit()), max(len(names) - 1, 1))
+    return ".".join(names[:first])
 
 
 def _common_checkpoints(runs: list[Run], note: Callable[[str], None]) -> list[Checkpoint]:
@@ -97,6 +149,7 @@ def _check_same(run: Run, wanted: dict[str, Any]) -> None:
         if changed:
             raise DelayRLError(
                 f"{run.path} holds a run with another {', '.join(changed)}; give another --out, or --overwrite"
+                + (f" (`delayrl train {run.path} --steps N` trains it further)" if "steps" in changed else "")
             )
 
 
@@ -105,7 +158,7 @@ def restore(group: Group, fresh: TrainState, checkpoints: list[Checkpoint]) -> T
     states = [restore_tree(group.template, c.arrays("agent"), c.path) for c in checkpoints]
     agent = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
     step = checkpoints[0].step
-    if checkpoints[0].complete:
+    if step >= group.setup.schedule.steps:
         return replace(fresh, step=step, learner=fresh.learner._replace(agent=agent))
     loops = [checkpoint.arrays("loop") for checkpoint in checkpoints]
     replays = []
@@ -151,16 +204,16 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
     pieces, stored = [], []
     for i, run in enumerate(group.runs):
         weights = flatten_tree(jax.tree.map(lambda x, i=i: x[i], agent))
-        if complete:
+        if complete and group.slim:
             run.save(state.step, weights, None, {}, complete=True)
             continue
         own, until = _save_replay(run, state, i, group.replay_rows)
-        run.save(state.step, weights, _loop_arrays(group, state, i), own)
+        run.save(state.step, weights, _loop_arrays(group, state, i), own, complete=complete)
         run.drop_pieces()
         pieces.append(own)
         stored.append(until)
     for run in group.runs if complete else []:  # once all seeds have their last checkpoint
-        run.finish()
+        run.finish(slim=group.slim)
     return state if complete else replace(state, pieces=pieces, stored=stored)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from delayrl.agents.base import State
 from delayrl.core.types import Key, Spec
+from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
@@ -27,6 +28,8 @@ class Group:
     template: State  # shapes and types of the agent's state
     program: Program
     apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other
+    slim: bool = False  # whether a finished run keeps only its last networks
+    source: Checkpoint | None = None  # of another run, whose networks training begins with
 
     @property
     def replay_rows(self) -> int:

@@ -2,9 +2,9 @@
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,14 @@ from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
+from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Condition, Setup, resolve
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
-from delayrl.training.buffers import keep_buffers
+from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.learner import compiled
 from delayrl.training.loop import run
-from delayrl.training.resume import start
+from delayrl.training.resume import source_of, start
 from delayrl.training.state import Group
 from delayrl.wrappers import Delayed
 from delayrl.wrappers.single import limit_of
@@ -48,6 +49,8 @@ def train(
     protocol: str = "corrected",
     track: str | None = None,
     threads: int = 1,
+    slim: bool = False,
+    start_from: str | Path | None = None,
     progress: bool = True,
     **values: Any,
 ) -> Any:
@@ -70,6 +73,9 @@ def train(
         protocol: "corrected", or "official": the released code's habits (docs/concepts.md).
         track: "tensorboard" or "wandb" as well (extras of the same names).
         threads: threads that step the environments, of training and of evaluation. The results do not depend on it.
+        slim: keep of a finished run only its last networks, and not what `go_on` takes (the replay).
+        start_from: the folder of another run, whose networks training begins with, as far as they fit: another delay,
+            another task of the same spaces, other options. Optimisers and replay are new.
         progress: show a progress bar and notes on stderr.
         **values: any hyperparameter or schedule option by name.
 
@@ -80,10 +86,34 @@ def train(
         DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
     """
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
-    if threads < 1:
-        raise DelayRLError(f"threads must be at least 1; got {threads}")
+    source = None
+    if start_from is not None:
+        origin, source = source_of(Path(start_from))
+        setup = replace(setup, origin={"from": origin})
     numbers = seed_numbers(seed, seeds)
     runs = run_folders(setup.condition, numbers, out)
+    ways: dict[str, Any] = {"device": device, "threads": threads, "track": track, "progress": progress, "slim": slim}
+    train_group(setup, numbers, runs, given=delay, overwrite=overwrite, source=source, **ways)
+    return runs[0] if seeds == 1 else runs
+
+
+def train_group(
+    setup: Setup,
+    numbers: list[int],
+    runs: list[Run],
+    *,
+    given: DelayLike | None = None,
+    device: str | None = None,
+    threads: int = 1,
+    track: str | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+    slim: bool = False,
+    source: Checkpoint | None = None,
+) -> None:
+    """Train seeds in lockstep, each in its folder, from where these stand. The arguments are those of `train`."""
+    if threads < 1:
+        raise DelayRLError(f"threads must be at least 1; got {threads}")
     observed = setup.delay.observed()
     envs = [make(setup.task, observed, rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
@@ -96,16 +126,16 @@ def train(
         actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
-        group = Group(setup, numbers, runs, keys, spec, shapes, program, pool.map if threads > 1 else map)
+        apply = pool.map if threads > 1 else map
+        group = Group(setup, numbers, runs, keys, spec, shapes, program, apply, slim, source)
 
         def note(line: str) -> None:
             if progress:
                 tqdm.write(line, file=sys.stderr)
 
-        if setup.delay.maximum and (seconds := seconds_of(envs[0])):
-            note(f"delay: {in_other_unit(delay, setup.delay, seconds)}")
+        if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
+            note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         run(group, start(group, actors, overwrite, note), note, progress=progress, track=track)
-    return runs[0] if seeds == 1 else runs
 
 
 def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
@@ -157,20 +187,3 @@ def check_fit(setup: Setup, env: Delayed) -> State:
         hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'"
         raise DelayRLError(f"{setup.task} has no time limit, so evaluation may never end; {hint}")
     return template(agent, spec)
-
-
-@contextmanager
-def on_device(name: str | None) -> Iterator[None]:
-    """Run on "cpu" or "gpu"; None leaves the choice to JAX."""
-    if name is None:
-        yield
-        return
-    if name not in ("cpu", "gpu"):
-        raise DelayRLError(f"device must be cpu or gpu; got {name!r}")
-    try:
-        device = jax.devices(name)[0]
-    except RuntimeError as error:
-        hint = "`pip install 'delayrl[cuda]'` brings CUDA, or use --device cpu"
-        raise DelayRLError(f"JAX finds no {name}; {hint}") from error
-    with jax.default_device(device):
-        yield

@@ -1,0 +1,107 @@
+"""`go_on`: a run trained further than it was planned."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from delayrl.agents.registry import find_agent
+from delayrl.envs.task import Task, TaskLike, stored_task
+from delayrl.errors import DelayRLError
+from delayrl.run.condition import Setup, overrides_of, resolve
+from delayrl.run.configuration import OLDER, values_of
+from delayrl.run.folder import Run
+from delayrl.training.train import train_group
+
+
+def go_on(
+    run: str | Path,
+    steps: int,
+    *,
+    env: TaskLike | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    device: str | None = None,
+    track: str | None = None,
+    threads: int = 1,
+    slim: bool = False,
+    progress: bool = True,
+) -> Any:
+    """Train a finished or unfinished run further, with its own options, up to more steps.
+
+    Its configuration says from then on how long it was before; its rows are those of one result. Options that an agent
+    takes as parts of the run, such as any-age's annealing, are parts of the new length.
+
+    Args:
+        run: the run folder, or the folder of the run folders of several seeds, which go on in lockstep.
+        steps: the new number of environment steps, from the beginning of the run.
+        env: what makes the environment, as `load`.
+        env_kwargs: keyword arguments of the environment that replace or complete the run's.
+        device: as `train`.
+        track: as `train`.
+        threads: as `train`.
+        slim: as `train`.
+        progress: as `train`.
+
+    Returns:
+        The run, or the list of runs.
+
+    Raises:
+        DelayRLError: no run, fewer steps than it has, a run whose replay is gone, and what `train` raises.
+    """
+    runs = seed_runs(Path(run))
+    configs = [one.config for one in runs]
+    setup = setup_of(configs[0], stored_task(configs[0]["env"], runs[0].path, env, env_kwargs), steps)
+    for one, config in zip(runs, configs, strict=True):
+        _check(one, config, configs[0], steps)
+    for one, config in zip(runs, configs, strict=True):
+        if config["schedule"]["steps"] != steps:
+            one.extend(config | setup.config | {"configuration": setup.configuration})
+    numbers = [config["seed"] for config in configs]
+    train_group(setup, numbers, runs, device=device, threads=threads, track=track, slim=slim, progress=progress)
+    return runs[0] if Run(Path(run)).exists else runs
+
+
+def seed_runs(path: Path) -> list[Run]:
+    """Return the run in a folder, or those of several seeds below it. Raises DelayRLError if there is none."""
+    below = sorted(path.glob("seed*/config.json"), key=lambda file: (len(file.parent.name), file.parent.name))
+    if Run(path).exists or not below:
+        return [Run(path)]
+    return [Run(file.parent) for file in below]
+
+
+def setup_of(config: Mapping[str, Any], task: Task, steps: int) -> Setup:
+    """Return the setup of a run with this configuration that is to have `steps` steps."""
+    stored = {**config["hyperparameters"], **config["schedule"]}
+    older = {name: value for name, value in OLDER.items() if name in _options(config)}
+    names = config["agent"], task, config["delay"], config["preset"], config["protocol"]
+    setup = resolve(*names, {**older, **stored, "steps": steps})
+    origin = dict(config.get("origin", {}))
+    if config["schedule"]["steps"] != steps:
+        origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]
+    setup = replace(setup, origin=origin)
+    return replace(setup, condition=replace(setup.condition, overrides=overrides_of(setup.config)))
+
+
+def _options(config: Mapping[str, Any]) -> set[str]:
+    """Return the names of all options that a run of this agent has today."""
+    registration = find_agent(config["agent"])
+    preset = registration.presets[config["preset"]]
+    return {*values_of(preset.agent), *values_of(preset.schedule)}
+
+
+def _check(run: Run, config: Mapping[str, Any], first: Mapping[str, Any], steps: int) -> None:
+    """Raise DelayRLError unless a run can go on to `steps` steps beside the first of its group."""
+    checkpoint = run.latest()
+    if steps < max(checkpoint.step, config["schedule"]["steps"]):
+        least = max(checkpoint.step, config["schedule"]["steps"])
+        raise DelayRLError(f"{run.path} has {least:,} steps; to train it further, give more than that: got {steps:,}")
+    if steps > checkpoint.step and not checkpoint.can_go_on:
+        raise DelayRLError(
+            f"{run.path} keeps only its networks, because it was trained with --slim or by an older version; "
+            f"--from {run.path} starts a new run with them"
+        )
+    own, others = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))
+    changing = ("seed", "versions", "cost", "origin", "configuration")  # a crash may have come between two seeds
+    for name in sorted(own.keys() | others.keys()):
+        if name not in changing and own.get(name) != others.get(name):
+            raise DelayRLError(f"{run.path} has another {name} than the other seeds; train it alone")

@@ -1,0 +1,125 @@
+"""Runs that go on after their end, and runs that begin with the networks of others."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import delayrl
+from conftest import quick
+from delayrl.cli.main import main
+from delayrl.run.folder import Run
+from delayrl.training.resume import part_of
+from short_runs import arrays, train
+
+
+def without_hash(run: Run) -> list[dict]:
+    return [{name: value for name, value in row.items() if name != "configuration"} for row in run.read("rows")]
+
+
+@pytest.mark.parametrize("agent", quick(["bpql", "vdpo"], "bpql"))
+def test_a_run_that_goes_on_is_the_longer_run(agent: str, tmp_path: Path) -> None:
+    """Twice further, from the end: rows and networks of a run that was planned so long from the beginning."""
+    whole = train(agent, tmp_path / "whole", steps=400)
+    run = train(agent, tmp_path / "run", steps=200)
+    short = run.config["configuration"]
+    for steps in (300, 400):
+        assert delayrl.go_on(run.path, steps, progress=False) == run
+    assert without_hash(run) == without_hash(whole)
+    for name, array in arrays(run).items():
+        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert run.config["origin"] == {"lengths": [200, 300]}
+    assert {row["configuration"] for row in run.read("rows")} == {run.config["configuration"]}
+    assert len({run.config["configuration"], whole.config["configuration"], short}) == 3  # a result of its own
+    assert delayrl.go_on(run.path, 400, progress=False).read("rows") == run.read("rows")  # nothing is left to do
+
+
+def test_seeds_go_on_together(tmp_path: Path) -> None:
+    """In lockstep, given their common folder; one of them had been extended already when the first try was killed."""
+    train("bpql", tmp_path / "runs", steps=200, seeds=2)
+    whole = train("bpql", tmp_path / "whole", steps=300, seeds=2)
+    again = tmp_path / "again"
+    shutil.copytree(tmp_path / "runs", again)
+    runs = delayrl.go_on(tmp_path / "runs", 300, progress=False)
+    assert [run.path.name for run in runs] == ["seed0", "seed1"]
+    assert [without_hash(run) for run in runs] == [without_hash(run) for run in whole]
+    for name in ("config.json", "rows.jsonl"):
+        rows = [
+            line for line in (runs[0].path / name).read_text().splitlines(keepends=True) if '"step": 300' not in line
+        ]
+        (again / "seed0" / name).write_text("".join(rows))
+    again_runs = delayrl.go_on(again, 300, progress=False)
+    assert [run.read("rows") for run in again_runs] == [run.read("rows") for run in runs]
+
+
+def test_what_cannot_go_on_is_left_as_it_is(tmp_path: Path) -> None:
+    slim = train("bpql", tmp_path / "slim", steps=200, slim=True)
+    assert not (slim.path / "replay").exists()
+    before = {file: file.read_bytes() for file in slim.path.rglob("*") if file.is_file()}
+    with pytest.raises(delayrl.DelayRLError, match=r"keeps only its networks, .*--from .*slim starts a new run"):
+        delayrl.go_on(slim.path, 300)
+    with pytest.raises(delayrl.DelayRLError, match="has 200 steps; to train it further, give more than that: got 150"):
+        delayrl.go_on(slim.path, 150)
+    with pytest.raises(delayrl.DelayRLError, match=r"another steps; .*--steps N` trains it further"):
+        train("bpql", slim.path, steps=300)
+    assert {file: file.read_bytes() for file in slim.path.rglob("*") if file.is_file()} == before
+    with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder"):
+        delayrl.go_on(tmp_path / "nowhere", 300)
+    train("bpql", tmp_path / "two" / "seed0", steps=200)
+    train("bpql", tmp_path / "two" / "seed1", steps=200, seed=1, delay=2)
+    with pytest.raises(delayrl.DelayRLError, match="seed1 has another delay than the other seeds; train it alone"):
+        delayrl.go_on(tmp_path / "two", 300)
+
+
+def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = train("bpql", tmp_path / "run", steps=200)
+    main(["train", str(run.path), "--steps", "3e2", "--quiet", "--slim"])
+    assert "300 steps" in capsys.readouterr().out
+    assert max(row["step"] for row in run.read("rows")) == 300
+    assert not (run.path / "replay").exists()
+    with pytest.raises(SystemExit):
+        main(["train", str(run.path)])
+    assert "--steps" in capsys.readouterr().err
+
+
+def test_networks_of_another_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those whose sizes fit, before the first update; the notes and the configuration say which run it was."""
+    old = train("bpql", tmp_path / "old", steps=200)
+    new = train("bpql", tmp_path / "new", steps=101, random_steps=100, delay=5, start_from=old.path, progress=True)
+    assert "taken over: critic, target, log_temperature; new: actor, and the optimisers" in capsys.readouterr().err
+    assert new.config["origin"]["from"] == {
+        "agent": "bpql",
+        "env": "Reacher-v5",
+        "delay": 3,
+        "seed": 0,
+        "configuration": old.config["configuration"],
+        "step": 200,
+        "networks": old.latest().files["agent.safetensors"],
+    }
+    before, after, fresh = arrays(old), arrays(new), arrays(train("bpql", tmp_path / "fresh", steps=101, delay=5))
+    for name in ("critic.0.0.w", "target.1.1.w"):  # two updates later they have moved by two steps of Adam
+        assert np.abs(after[name] - before[name]).max() < 1e-2 < np.abs(after[name] - fresh[name]).max()
+    assert after["critic_opt_state.0.count"] == 2
+    assert new.config["configuration"] != Run(tmp_path / "fresh").config["configuration"]
+    assert len({row["configuration"] for row in new.read("rows")}) == 1
+
+
+def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old = train("sac", tmp_path / "sac", steps=200)
+    new = train("vdpo", tmp_path / "vdpo", steps=100, start_from=old.path, progress=True)
+    assert "taken over: reference.actor, reference.critic, reference.target" in capsys.readouterr().err
+    assert np.abs(arrays(new)["reference.critic.0.0.w"] - arrays(old)["critic.0.0.w"]).max() < 5e-3
+    with pytest.raises(delayrl.DelayRLError, match="sac has no network that fits: it lacks"):
+        train("dcac", tmp_path / "dcac", start_from=old.path)
+
+
+def test_parts_of_a_state() -> None:
+    names = ["critic.0.2.w", "reference.actor.1.b", "log_temperature", "encoder.position", "encoder.blocks.0.out.w"]
+    assert [part_of(name) for name in names] == [
+        "critic",
+        "reference.actor",
+        "log_temperature",
+        "encoder",
+        "encoder.blocks",
+    ]
