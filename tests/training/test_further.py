@@ -57,13 +57,21 @@ def test_what_cannot_go_on_is_left_as_it_is(tmp_path: Path) -> None:
     slim = train("bpql", tmp_path / "slim", steps=200, slim=True)
     assert not (slim.path / "replay").exists()
     before = {file: file.read_bytes() for file in slim.path.rglob("*") if file.is_file()}
-    with pytest.raises(delayrl.DelayRLError, match=r"keeps only its networks, .*--from .*slim starts a new run"):
+    with pytest.raises(delayrl.DelayRLError, match=r"keeps no replay; --from .*slim starts a new run"):
         delayrl.go_on(slim.path, 300)
     with pytest.raises(delayrl.DelayRLError, match="has 200 steps; to train it further, give more than that: got 150"):
         delayrl.go_on(slim.path, 150)
     with pytest.raises(delayrl.DelayRLError, match=r"another steps; .*--steps N` trains it further"):
         train("bpql", slim.path, steps=300)
     assert {file: file.read_bytes() for file in slim.path.rglob("*") if file.is_file()} == before
+    part = train("bpql", tmp_path / "part", steps=200)
+    shutil.rmtree(part.path / "replay")
+    assert delayrl.load(part.path)  # what a finished run is for is still there
+    assert train("bpql", part.path, steps=200).read("rows")
+    with pytest.raises(
+        delayrl.DelayRLError, match=r"part has lost a part of its replay .*--from .*part starts a new run"
+    ):
+        delayrl.go_on(part.path, 300)
     with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder"):
         delayrl.go_on(tmp_path / "nowhere", 300)
     train("bpql", tmp_path / "two" / "seed0", steps=200)

@@ -37,11 +37,15 @@ class Checkpoint:
 
         return load_arrays(self.path / f"{name}.safetensors")
 
-    def check(self) -> None:
-        """Raise DelayRLError if a file that it names is cut or changed."""
+    def check(self, *, further: bool = False) -> None:
+        """Raise DelayRLError if a file that it needs is cut or changed.
+
+        A complete run needs its replay only to be trained `further`.
+        """
         replay = self.path.parents[1] / "replay"
-        for name, checksum in (self.files | self.pieces).items():
-            file = (replay if name in self.pieces else self.path) / name
+        pieces = {} if self.complete and not further else self.pieces
+        for name, checksum in (self.files | pieces).items():
+            file = (replay if name in pieces else self.path) / name
             if Path(name).name != name or "\0" in name or _checksum(file) != checksum:
                 raise DelayRLError(f"{name} is cut or changed")
 

@@ -95,11 +95,16 @@ def _check(run: Run, config: Mapping[str, Any], first: Mapping[str, Any], steps:
     if steps < max(checkpoint.step, config["schedule"]["steps"]):
         least = max(checkpoint.step, config["schedule"]["steps"])
         raise DelayRLError(f"{run.path} has {least:,} steps; to train it further, give more than that: got {steps:,}")
-    if steps > checkpoint.step and not checkpoint.can_go_on:
-        raise DelayRLError(
-            f"{run.path} keeps only its networks, because it was trained with --slim or by an older version; "
-            f"--from {run.path} starts a new run with them"
-        )
+    if steps > checkpoint.step:
+        hint = f"--from {run.path} starts a new run with its networks"
+        if not checkpoint.can_go_on:
+            raise DelayRLError(
+                f"{run.path} was trained with --slim, or by an older version, and keeps no replay; {hint}"
+            )
+        try:
+            checkpoint.check(further=True)
+        except (OSError, DelayRLError) as error:
+            raise DelayRLError(f"{run.path} has lost a part of its replay ({error}); {hint}") from error
     own, others = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))
     changing = ("seed", "versions", "cost", "origin", "configuration")  # a crash may have come between two seeds
     for name in sorted(own.keys() | others.keys()):

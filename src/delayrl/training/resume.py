@@ -84,9 +84,8 @@ def _from_source(group: Group, state: TrainState, note: Callable[[str], None]) -
     arrays |= {f"reference.{name}": array for name, array in arrays.items()}  # a reference is an agent of its own
     taken, left = fitting(fresh, arrays)
     if not taken:
-        raise DelayRLError(
-            f"{group.source.path.parents[1]} has no network that fits: {', '.join(left)} have other sizes"
-        )
+        where = group.source.path.parents[1]
+        raise DelayRLError(f"{where} has no network that fits: it lacks {', '.join(left)}, or has them in other sizes")
     note(f"taken over: {', '.join(taken)}; new: {', '.join(left) or 'no network'}, and the optimisers")
     names = [name for name in fresh if "opt_state" not in name and part_of(name) in taken]
 
