@@ -16,8 +16,11 @@ if TYPE_CHECKING:
     from delayrl.delays import as_delay as as_delay
     from delayrl.envs import make as make
     from delayrl.errors import DelayRLError as DelayRLError
+    from delayrl.play.evaluation import evaluate as evaluate
     from delayrl.play.policy import Policy as Policy
     from delayrl.play.policy import load as load
+    from delayrl.run.folder import Run as Run
+    from delayrl.run.folder import runs as runs
     from delayrl.training.further import go_on as go_on
     from delayrl.training.train import train as train
     from delayrl.wrappers import AugmentedObservation as AugmentedObservation
@@ -37,8 +40,11 @@ _HOME = {
     "DelayedVector": "wrappers",
     "as_delay": "delays",
     "Policy": "play.policy",
+    "Run": "run.folder",
+    "evaluate": "play.evaluation",
     "load": "play.policy",
     "make": "envs",
+    "runs": "run.folder",
     "go_on": "training.further",
     "train": "training.train",
 }

@@ -15,6 +15,8 @@ COMMANDS = {
     "train": "train an agent, or resume a run",
     "evaluate": "play a trained policy on start states that it never saw",
     "watch": "render an episode to a file",
+    "runs": "list the runs in a folder",
+    "compare": "compare runs: options, returns, learning curves",
     "measure": "measure the delay of an environment, or from a log",
     "export": "write a run's policy as a bundle, for use without JAX",
     "latency": "measure how long one decision of a bundle takes",

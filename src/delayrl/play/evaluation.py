@@ -17,10 +17,10 @@ from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
-from delayrl.envs.task import Task, TaskLike
+from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, load, task_of
-from delayrl.run.folder import Run
+from delayrl.run.folder import Run, as_run
 
 
 class Episodes(NamedTuple):
@@ -138,7 +138,7 @@ TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
 
 
 def evaluate(
-    run: str | Path,
+    run: str | Path | Run | Policy,
     episodes: int = 10,
     delay: int | str | None = None,
     seed: int = 0,
@@ -146,10 +146,10 @@ def evaluate(
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Play the policy of a run folder on start states that it never saw.
+    """Play the policy of a run on start states that it never saw.
 
     Args:
-        run: the run folder.
+        run: the run, its folder, or a policy, whose task `env` then has to say.
         episodes: how many.
         delay: any delay that it can serve, a number or a text; None for the one it was trained for.
         seed: of the start states.
@@ -162,12 +162,18 @@ def evaluate(
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
-    config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
-    return _play(load(run, task), config, task, config["delay"] if delay is None else delay, episodes, seed)
+    if isinstance(run, Policy):
+        if env is None:
+            raise DelayRLError("a policy does not say what its task is: give env, or a run")
+        task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
+    else:
+        config, task = as_run(run).config, task_of(run, env, env_kwargs)
+        policy, name, usual = load(run, task), config["agent"], config["delay"]
+    return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
 
 def sweep(
-    run: str | Path,
+    run: str | Path | Run,
     episodes: int = 10,
     seed: int = 0,
     *,
@@ -175,15 +181,13 @@ def sweep(
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
-    config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
+    name, task = as_run(run).config["agent"], task_of(run, env, env_kwargs)
     policy = load(run, task)
     for delay in range(policy.spec.delay + 1):
-        yield _play(policy, config, task, delay, episodes, seed)
+        yield _play(policy, name, task, delay, episodes, seed)
 
 
-def _play(
-    policy: Policy, config: dict[str, Any], task: Task, delay: int | str, episodes: int, seed: int
-) -> dict[str, Any]:
+def _play(policy: Policy, name: str, task: Task, delay: int | str, episodes: int, seed: int) -> dict[str, Any]:
     if episodes < 1:
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
     check_seed(seed)
@@ -194,7 +198,7 @@ def _play(
     with jax.default_matmul_precision("float32"):  # a GPU's own is coarser
         returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
     return {
-        "agent": config["agent"],
+        "agent": name,
         "env": str(task),
         "delay": parsed.label(),
         "episodes": episodes,

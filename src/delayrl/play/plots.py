@@ -1,12 +1,13 @@
 """Figures of one run: returns against steps, and against the delay."""
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
@@ -36,7 +37,16 @@ def against_delay(results: list[dict[str, Any]], path: Path) -> None:
         axes.set(xlabel="delay of the observations (steps)", ylabel="return", title=title)
 
 
-def _band(axes: Any, x: list[float], values: list[list[float]], colour: str, label: str) -> None:
+def curves(groups: Sequence[tuple[str, NDArray[Any], NDArray[Any]]], path: Path, title: str) -> None:
+    """Draw learning curves beside each other: for each label and its steps, [N], mean and range of [seeds, N]."""
+    with _axes(path) as axes:
+        for number, (label, steps, returns) in enumerate(groups):
+            _band(axes, list(steps), list(returns.T), f"C{number}", label)
+        axes.set(xlabel="environment steps", ylabel="return, mean and range of the seeds", title=title)
+        axes.legend(frameon=False)
+
+
+def _band(axes: Any, x: list[float], values: Sequence[Any], colour: str, label: str) -> None:
     axes.plot(x, [np.mean(v) for v in values], color=colour, label=label, marker="o", markersize=3)
     low, high = [np.min(v) for v in values], [np.max(v) for v in values]
     axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)

@@ -18,7 +18,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.arrays import restore_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import agent_of
-from delayrl.run.folder import Run
+from delayrl.run.folder import Run, as_run
 
 
 class Policy:
@@ -62,11 +62,11 @@ class Policy:
         return self.low + (action + 1) / 2 * (self.high - self.low)
 
 
-def load(path: str | Path, env: TaskLike | None = None, *, env_kwargs: Mapping[str, Any] | None = None) -> Policy:
+def load(path: str | Path | Run, env: TaskLike | None = None, *, env_kwargs: Mapping[str, Any] | None = None) -> Policy:
     """Load the policy of a run folder from its newest good checkpoint.
 
     Args:
-        path: the run folder.
+        path: the run, or its folder.
         env: what makes its environment, if the run cannot name it (a lambda) or may not (docs/own-task.md). It gets the
             keyword arguments and wrappers of the run.
         env_kwargs: keyword arguments of the environment that replace or complete the run's.
@@ -74,13 +74,14 @@ def load(path: str | Path, env: TaskLike | None = None, *, env_kwargs: Mapping[s
     Raises:
         DelayRLError: no run folder, no good checkpoint, one of another agent, a task that cannot be made.
     """
-    run = Run(Path(path))
-    return restored(run.config, run.latest(), task_of(path, env, env_kwargs))
+    run = as_run(path)
+    return restored(run.config, run.latest(), task_of(run, env, env_kwargs))
 
 
-def task_of(path: str | Path, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
-    """Return the task of a run folder, or the one given instead, as `load`."""
-    return stored_task(Run(Path(path)).config["env"], Path(path), env, env_kwargs)
+def task_of(path: str | Path | Run, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
+    """Return the task of a run, or the one given instead, as `load`."""
+    run = as_run(path)
+    return stored_task(run.config["env"], run.path, env, env_kwargs)
 
 
 def restored(config: dict[str, Any], checkpoint: Checkpoint, task: Task) -> Policy:

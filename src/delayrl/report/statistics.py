@@ -102,6 +102,15 @@ def stratified_bootstrap(
     return (low, high) if known else (np.full_like(low, NAN), np.full_like(high, NAN))
 
 
+def mean_interval(values: ArrayLike, repetitions: int = REPETITIONS, seed: int = 0) -> tuple[float, float]:
+    """Estimate the 95 % percentile interval of a mean by resampling its values; NaN with fewer than two."""
+    x = np.asarray(values, float)
+    if x.size < 2:
+        return NAN, NAN
+    low, high = np.percentile(_resample(np.random.default_rng(seed), x, repetitions).mean(1), PERCENTILES)
+    return float(low), float(high)
+
+
 def bootstrap_steps(
     steps: ArrayLike, curves: Floats, reference: Floats, repetitions: int = REPETITIONS, seed: int = 0
 ) -> tuple[float, float]:

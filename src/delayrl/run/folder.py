@@ -4,6 +4,7 @@
 config.json         what is trained, on what, with which versions
 rows.jsonl          one row for each evaluation episode
 metrics.jsonl       losses and speed
+episodes.jsonl      one row for each episode of training
 curve.png           return against steps
 checkpoints/STEP/   agent.safetensors, loop.safetensors, manifest.json (checksums); the last two are kept
 replay/             the trajectory in pieces, each written once; a run with --slim deletes it when it is complete
@@ -17,7 +18,10 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, save_arrays
@@ -29,14 +33,26 @@ NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
 CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
-FILES = ("rows.jsonl", "metrics.jsonl", "curve.png", "delays.png", "config.json")
+LINES = ("rows", "metrics", "episodes")
+FILES = (*(f"{name}.jsonl" for name in LINES), "curve.png", "delays.png", "config.json")
+
+
+class Curve(NamedTuple):
+    """Returns of a policy against the environment steps of its training."""
+
+    steps: NDArray[np.int64]  # [evaluations]
+    returns: NDArray[np.float64]  # [evaluations, episodes]
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder."""
+    """A run folder, or what will be one. `delayrl.load` gives its policy."""
 
     path: Path
+
+    def __post_init__(self) -> None:
+        """Take the path as text too."""
+        object.__setattr__(self, "path", Path(self.path))
 
     @property
     def exists(self) -> bool:
@@ -67,6 +83,22 @@ class Run:
             raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
         return config  # type: ignore[no-any-return]
 
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one row for each evaluation episode: what was trained, step, start state, return, length."""
+        return self.read("rows")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Return losses and speed, a row for every 1,000 steps."""
+        return self.read("metrics")
+
+    def episodes(self) -> list[dict[str, Any]]:
+        """Return one row for each finished episode of training: step of its end, seed, number, return, length."""
+        return self.read("episodes")
+
+    def curve(self, policy: str = "agent") -> Curve:
+        """Return the returns of each evaluation of the agent, or of its delay-free "reference"."""
+        return _curve([row for row in self.rows() if row["policy"] == policy])
+
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""
         with disk_errors(self.path):
@@ -80,14 +112,14 @@ class Run:
                 remove(self.path / name)
 
     def append(self, name: str, rows: list[dict[str, Any]]) -> None:
-        """Add lines to rows.jsonl or metrics.jsonl."""
+        """Add lines to one of the files LINES."""
         with disk_errors(self.path), open(self.path / f"{name}.jsonl", "a") as file:
             file.write("".join(json.dumps(row) + "\n" for row in rows))
             file.flush()
             os.fsync(file.fileno())
 
     def read(self, name: str) -> list[dict[str, Any]]:
-        """Return the lines of rows.jsonl or metrics.jsonl, without a last line that a crash cut off."""
+        """Return the lines of one of the files LINES, without a last line that a crash cut off."""
         file = self.path / f"{name}.jsonl"
         try:
             lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
@@ -105,7 +137,7 @@ class Run:
     def rewind(self, step: int) -> None:
         """Delete rows and checkpoints of later steps than `step`: the resumed run makes them again."""
         with disk_errors(self.path):
-            for name in ("rows", "metrics"):
+            for name in LINES:
                 if (self.path / f"{name}.jsonl").is_file():
                     kept = [row for row in self.read(name) if row["step"] <= step]
                     write_file(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
@@ -179,6 +211,42 @@ class Run:
         abandoned = (self.path / "checkpoints").glob(".*draft")  # by a process that was killed
         for old in [*checkpoint_folders(self.path)[kept:], *abandoned]:
             shutil.rmtree(old, ignore_errors=True)
+
+
+def _curve(rows: list[dict[str, Any]]) -> Curve:
+    returns: dict[int, list[float]] = {}
+    for row in rows:
+        returns.setdefault(row["step"], []).append(row["return"])
+    steps = sorted(returns)
+    table = np.array([returns[step] for step in steps]).reshape(len(steps), -1 if steps else 0)
+    return Curve(np.array(steps, np.int64), table)
+
+
+def as_run(run: "str | Path | Run") -> Run:
+    """Return the run in a folder, or the run itself."""
+    return run if isinstance(run, Run) else Run(Path(run))
+
+
+def runs(folder: str | Path = "runs") -> list[Run]:
+    """Return all runs in a folder and below it, by their paths. Raises DelayRLError if there is no such folder."""
+    if not Path(folder).is_dir():
+        raise DelayRLError(f"there is no folder {folder}")
+    return [Run(file.parent) for file in sorted(Path(folder).rglob("config.json")) if _is_config(file)]
+
+
+def seed_runs(path: Path) -> list[Run]:
+    """Return the run in a folder, or those of several seeds below it. Raises DelayRLError if there is none."""
+    below = sorted(path.glob("seed*/config.json"), key=lambda file: (len(file.parent.name), file.parent.name))
+    if Run(path).exists or not below:
+        return [Run(path)]
+    return [Run(file.parent) for file in below]
+
+
+def _is_config(file: Path) -> bool:
+    try:
+        return CONFIG.keys() <= json.loads(file.read_text()).keys()
+    except (ValueError, OSError, AttributeError):
+        return False
 
 
 def _delete_checkpoint(path: Path) -> None:

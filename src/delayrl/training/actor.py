@@ -18,14 +18,17 @@ class Actor:
 
     seen: Seen
     truth: NDArray[np.float32]  # the true observation now, [S]
+    total: float  # the return of the current episode so far
+    finished: list[dict[str, Any]]  # number, return and length of episodes that ended, until somebody takes them
 
     def __init__(self, env: Delayed, seed: int, privileged: bool, protocol: Protocol = CORRECTED) -> None:
         self.env, self.seed, self.privileged, self.protocol = env, seed, privileged, protocol
+        self.finished = []
         self.start_episode(0)
 
     def start_episode(self, episode: int) -> None:
         """Start an episode from its own seed, or under protocol `official` from the run's."""
-        self.episode, self.actions = episode, list[NDArray[np.float32]]()
+        self.episode, self.actions, self.total = episode, list[NDArray[np.float32]](), 0.0
         own_seed = reset_seed(self.seed, TRAINING, episode)
         if self.protocol.start_states == "same":
             shown = self.env.reset(seed=self.seed)
@@ -45,6 +48,7 @@ class Actor:
         reward, done = float(reward), terminated or truncated
         if not np.isfinite(reward):
             self._refuse("a reward")
+        self.total += reward
         transition = Transition(
             truth,  # type: ignore[arg-type]
             age,
@@ -56,6 +60,7 @@ class Actor:
             self.seen.age,
         )
         if done:
+            self.finished.append({"episode": self.episode, "return": self.total, "length": len(self.actions)})
             self.start_episode(self.episode + 1)
         return transition
 
@@ -63,8 +68,9 @@ class Actor:
         """Come back to the middle of an episode: the same seed and actions lead to the same state."""
         self.start_episode(episode)
         for action in actions:
-            obs, _, _, _, info = self.env.step(action)
+            obs, reward, _, _, info = self.env.step(action)
             self.actions.append(action)
+            self.total += float(reward)
             self._see(obs, info)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:

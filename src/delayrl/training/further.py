@@ -10,12 +10,13 @@ from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
-from delayrl.run.folder import Run
+from delayrl.run.folder import Run, as_run, seed_runs
+from delayrl.training.loop import Callback
 from delayrl.training.train import train_group
 
 
 def go_on(
-    run: str | Path,
+    run: str | Path | Run,
     steps: int,
     *,
     env: TaskLike | None = None,
@@ -24,6 +25,7 @@ def go_on(
     track: str | None = None,
     threads: int = 1,
     slim: bool = False,
+    callback: Callback | None = None,
     progress: bool = True,
 ) -> Any:
     """Train a finished or unfinished run further, with its own options, up to more steps.
@@ -40,6 +42,7 @@ def go_on(
         track: as `train`.
         threads: as `train`.
         slim: as `train`.
+        callback: as `train`.
         progress: as `train`.
 
     Returns:
@@ -48,7 +51,8 @@ def go_on(
     Raises:
         DelayRLError: no run, fewer steps than it has, a run whose replay is gone, and what `train` raises.
     """
-    runs = seed_runs(Path(run))
+    folder = as_run(run)
+    runs = seed_runs(folder.path)
     configs = [one.config for one in runs]
     setup = setup_of(configs[0], stored_task(configs[0]["env"], runs[0].path, env, env_kwargs), steps)
     for one, config in zip(runs, configs, strict=True):
@@ -57,16 +61,18 @@ def go_on(
         if config["schedule"]["steps"] != steps:
             one.extend(config | setup.config | {"configuration": setup.configuration})
     numbers = [config["seed"] for config in configs]
-    train_group(setup, numbers, runs, device=device, threads=threads, track=track, slim=slim, progress=progress)
-    return runs[0] if Run(Path(run)).exists else runs
-
-
-def seed_runs(path: Path) -> list[Run]:
-    """Return the run in a folder, or those of several seeds below it. Raises DelayRLError if there is none."""
-    below = sorted(path.glob("seed*/config.json"), key=lambda file: (len(file.parent.name), file.parent.name))
-    if Run(path).exists or not below:
-        return [Run(path)]
-    return [Run(file.parent) for file in below]
+    train_group(
+        setup,
+        numbers,
+        runs,
+        device=device,
+        threads=threads,
+        track=track,
+        slim=slim,
+        callback=callback,
+        progress=progress,
+    )
+    return runs[0] if folder.exists else runs
 
 
 def setup_of(config: Mapping[str, Any], task: Task, steps: int) -> Setup:

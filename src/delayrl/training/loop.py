@@ -20,6 +20,7 @@ from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, StoppedError
 from delayrl.play.evaluation import RANDOM_ACTIONS
 from delayrl.play.plots import curve
+from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.estimate import estimate
 from delayrl.training.learner import Stored
@@ -29,12 +30,20 @@ from delayrl.training.signals import stop_signal
 from delayrl.training.state import Group, TrainState
 
 METRICS_EVERY = 1000
+Callback = Callable[[int, list[Run]], Any]
+"""A function of the step and the runs, called after each evaluation is stored. If it returns true, training ends."""
 
 
 def run(
-    group: Group, state: TrainState, note: Callable[[str], None], *, progress: bool = False, track: str | None = None
+    group: Group,
+    state: TrainState,
+    note: Callable[[str], None],
+    *,
+    progress: bool = False,
+    track: str | None = None,
+    callback: Callback | None = None,
 ) -> None:
-    """Train from a state to the last step, changing it, and draw the learning curves.
+    """Train from a state to the last step, or until the callback ends it, and draw the learning curves.
 
     Raises:
         StoppedError: the process was asked to stop; the newest step is stored.
@@ -49,7 +58,7 @@ def run(
         options = {"disable": not progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
         bar = tqdm(total=steps, initial=state.step, unit="step", **options)
         with stop_signal() as stop, bar:
-            loop.train(stop.is_set, bar)
+            loop.train(stop.is_set, bar, callback)
     for folder in group.runs:
         curve(folder.read("rows"), folder.path / "curve.png")
 
@@ -60,14 +69,16 @@ class Loop:
     def __init__(self, group: Group, state: TrainState, recorder: Recorder) -> None:
         self.group, self.state, self._recorder = group, state, recorder
         self._metrics: Metrics = {}
+        self._ended: list[list[dict[str, Any]]] = [[] for _ in group.runs]  # episodes of each seed, not yet written
         self._learning = False
         self._began, self._began_step = time.perf_counter(), state.step
 
-    def train(self, stopped: Callable[[], bool], bar: Any) -> None:
-        """Train until the last step, or until `stopped()`."""
+    def train(self, stopped: Callable[[], bool], bar: Any, callback: Callback | None = None) -> None:
+        """Train until the last step, until `stopped()`, or until an evaluation after which the callback is true."""
         schedule, state = self.group.setup.schedule, self.state
         while state.step < schedule.steps:
             if stopped():
+                self._recorder.episodes(self._ended)
                 self.state = save(self.group, state)
                 raise StoppedError(f"stopped at step {state.step:,}; the same command goes on from there")
             self.step()
@@ -79,7 +90,10 @@ class Loop:
                 self.choose()  # before learning, as at every other step
                 self.learn()  # what is evaluated has learned from every step before
                 bar.set_postfix_str(self._recorder.evaluate(state.step, state.learner.agent))
+                self._recorder.episodes(self._ended)
                 self.state = state = save(self.group, state, complete=state.step == schedule.steps)
+                if callback and callback(state.step, self.group.runs) and state.step < schedule.steps:
+                    return
 
     def step(self) -> None:
         """Act once in every environment, and learn from the steps before if a block of them is full."""
@@ -96,6 +110,9 @@ class Loop:
             ]
         )
         state.step += 1
+        for actor, ended in zip(state.actors, self._ended, strict=True):
+            ended += [{"step": state.step, "seed": actor.seed, **episode} for episode in actor.finished]
+            actor.finished.clear()
 
     def choose(self) -> Any:
         """Return the next actions, chosen by what was learned until now. Does not wait for them."""

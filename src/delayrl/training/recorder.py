@@ -72,6 +72,13 @@ class Recorder:
                 tracker.write(step, {f"return/{policy}": float(played.returns[i].mean())})
         return " · ".join(summary)
 
+    def episodes(self, ended: list[list[dict[str, Any]]]) -> None:
+        """Write a row for each episode of training that ended, [seeds][episodes], and empty the lists."""
+        for run, own in zip(self._group.runs, ended, strict=True):
+            if own:
+                run.append("episodes", own)
+                own.clear()
+
     def log(self, step: int, metrics: Metrics, steps_per_second: float) -> None:
         """Write the newest metrics of each seed. Raises DelayRLError for one that is not finite."""
         values = jax.device_get(metrics)

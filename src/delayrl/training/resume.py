@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -68,9 +67,8 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     return state
 
 
-def source_of(path: Path) -> tuple[dict[str, Any], Checkpoint]:
+def source_of(run: Run) -> tuple[dict[str, Any], Checkpoint]:
     """Return what the configuration says of a run whose networks another one begins with, and its newest checkpoint."""
-    run = Run(path)
     checkpoint, names = run.latest(), ("agent", "env", "delay", "seed", "configuration")
     described = {name: run.config[name] for name in names if name in run.config}
     return described | {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}, checkpoint

@@ -1,6 +1,5 @@
 """`train`: from what the user gave to a finished run."""
 
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,16 +16,16 @@ from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
-from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.condition import Condition, Setup, resolve
-from delayrl.run.folder import Run
+from delayrl.run.condition import Setup, resolve
+from delayrl.run.folder import Run, as_run
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.learner import compiled
-from delayrl.training.loop import run
+from delayrl.training.loop import Callback, run
 from delayrl.training.resume import source_of, start
+from delayrl.training.seeds import run_folders, seed_numbers
 from delayrl.training.state import Group
 from delayrl.wrappers import Delayed
 from delayrl.wrappers.single import limit_of
@@ -50,7 +49,8 @@ def train(
     track: str | None = None,
     threads: int = 1,
     slim: bool = False,
-    start_from: str | Path | None = None,
+    start_from: str | Path | Run | None = None,
+    callback: Callback | None = None,
     progress: bool = True,
     **values: Any,
 ) -> Any:
@@ -76,6 +76,8 @@ def train(
         slim: keep of a finished run only its last networks, and not what `go_on` takes (the replay).
         start_from: the folder of another run, whose networks training begins with, as far as they fit: another delay,
             another task of the same spaces, other options. Optimisers and replay are new.
+        callback: called with the step and the list of runs after each evaluation, once it is stored. If it returns
+            something true, training ends there; the same call goes on.
         progress: show a progress bar and notes on stderr.
         **values: any hyperparameter or schedule option by name.
 
@@ -88,11 +90,12 @@ def train(
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
     source = None
     if start_from is not None:
-        origin, source = source_of(Path(start_from))
+        origin, source = source_of(as_run(start_from))
         setup = replace(setup, origin={"from": origin})
     numbers = seed_numbers(seed, seeds)
     runs = run_folders(setup.condition, numbers, out)
     ways: dict[str, Any] = {"device": device, "threads": threads, "track": track, "progress": progress, "slim": slim}
+    ways["callback"] = callback
     train_group(setup, numbers, runs, given=delay, overwrite=overwrite, source=source, **ways)
     return runs[0] if seeds == 1 else runs
 
@@ -110,6 +113,7 @@ def train_group(
     progress: bool = True,
     slim: bool = False,
     source: Checkpoint | None = None,
+    callback: Callback | None = None,
 ) -> None:
     """Train seeds in lockstep, each in its folder, from where these stand. The arguments are those of `train`."""
     if threads < 1:
@@ -135,35 +139,7 @@ def train_group(
 
         if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
-        run(group, start(group, actors, overwrite, note), note, progress=progress, track=track)
-
-
-def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
-    """Return the seeds to train: `seeds` many from `seed` on, or those listed. Raises DelayRLError for bad ones."""
-    if isinstance(seeds, int):
-        if seeds < 1:
-            raise DelayRLError(f"seeds must be at least 1; got {seeds}")
-        numbers = list(range(seed, seed + seeds))
-    else:
-        numbers = list(seeds)
-        different = len(set(numbers)) == len(numbers) and all(isinstance(number, int) for number in numbers)
-        if seed or not numbers or not different:
-            raise DelayRLError(f"seeds is a number, or a list of different seeds without seed=; got {seeds!r}")
-    check_seed(min(numbers))
-    check_seed(max(numbers))
-    return numbers
-
-
-def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[Run]:
-    """Return the run folder of each seed: below `out`, or where it is None below runs/."""
-    kind = f"{condition.agent}-{condition.preset}"
-    if condition.protocol != "corrected":
-        kind += f"-{condition.protocol}"
-    task = re.sub(r"[^\w.=+@-]+", "-", condition.place)
-    home = Path(out) if out is not None else Path("runs") / task / kind
-    if out is not None and len(seeds) == 1:
-        return [Run(home)]
-    return [Run(home / f"seed{seed}") for seed in seeds]
+        run(group, start(group, actors, overwrite, note), note, progress=progress, track=track, callback=callback)
 
 
 def check_fit(setup: Setup, env: Delayed) -> State:

@@ -1,0 +1,71 @@
+"""`delayrl compare A B …`: what differs between runs, in options and in returns."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from delayrl.cli.console import print_table
+from delayrl.errors import DelayRLError
+
+LABELS = "ABCDEFGH"
+ABOUT = ("seed", "versions", "cost", "configuration", "format", "privileged")
+"""Entries of a configuration that are no options."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the runs and the picture."""
+    words = "two to eight run folders, or folders of the runs of several seeds"
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help=words)
+    parser.add_argument("--out", type=Path, default=Path("compare.png"), help="the picture (default: compare.png)")
+
+
+def run(given: argparse.Namespace) -> None:
+    """Print the options that differ and the returns, and draw the learning curves."""
+    from delayrl.play.plots import curves
+    from delayrl.report.statistics import area, common_steps, mean_interval
+    from delayrl.run.folder import seed_runs
+
+    if not 2 <= len(given.runs) <= len(LABELS):
+        raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")
+    groups = [seed_runs(path) for path in given.runs]
+    configs = [group[0].config for group in groups]
+    labels = LABELS[: len(groups)]
+    for label, path, group in zip(labels, given.runs, groups, strict=True):
+        print(f"{label}  {path}" + (f" ({len(group)} seeds)" if len(group) > 1 else ""))
+    different = differences(configs)
+    print()
+    print_table(["option", *labels], different or [["all options", *["the same"] * len(labels)]])
+    rows, drawn = [], []
+    for label, config, group in zip(labels, configs, groups, strict=True):
+        means = [{int(step): float(x.mean()) for step, x in zip(*one.curve(), strict=True)} for one in group]
+        steps, returns = common_steps(means)
+        if not len(steps):
+            raise DelayRLError(f"{group[0].path.parent if len(group) > 1 else group[0].path} has no evaluation yet")
+        drawn.append((f"{label}: {config['agent']}, delay {config['delay']}", steps, returns))
+        cells = [label, f"{int(steps[-1]):,}", len(group)]
+        for values in (returns[:, -1], area(steps, returns)):
+            text = f"{values.mean():,.1f}"
+            if len(group) > 1:
+                low, high = mean_interval(values)
+                text += f" [{low:,.1f}, {high:,.1f}]"
+            cells.append(text)
+        rows.append(cells)
+    print()
+    print_table(["", "steps", "seeds", "last return", "mean over training"], rows)
+    if any(len(group) > 1 for group in groups):
+        print("[low, high]: 95 % bootstrap interval over seeds")
+    curves(drawn, given.out, configs[0]["env"] if len({config["env"] for config in configs}) == 1 else "")
+    print(f"{given.out}: learning curves")
+
+
+def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
+    """Return name and values of each option in which configurations differ; "-" where one has no such option."""
+    options = [
+        {name: value for name, value in config.items() if name not in ABOUT and not isinstance(value, dict)}
+        | {name: value for part in config.values() if isinstance(part, dict) for name, value in part.items()}
+        for config in ({k: v for k, v in config.items() if k not in ABOUT} for config in configs)
+    ]
+    names = dict.fromkeys(name for own in options for name in own)
+    rows = [[name, *(own.get(name, "-") for own in options)] for name in names]
+    return [row for row in rows if any(value != row[1] for value in row[2:])]

@@ -1,0 +1,126 @@
+"""What a script does with runs: curves, training episodes, callbacks, lists of runs, evaluation."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import delayrl
+from delayrl.cli.main import main
+from delayrl.play.evaluation import RANDOM_ACTIONS, TRAINING, reset_seed
+from delayrl.run.folder import Run
+from short_runs import arrays, killed_and_resumed, train
+
+
+def test_curves_are_those_of_the_rows(vdpo: Run) -> None:
+    for policy in ("agent", "reference"):
+        steps, returns = vdpo.curve(policy)
+        assert steps.tolist() == [100, 200, 300]
+        rows = [row for row in vdpo.rows() if row["policy"] == policy]
+        np.testing.assert_array_equal(returns, np.reshape([row["return"] for row in rows], (3, 2)))
+    nothing = delayrl.Run("nowhere").curve()
+    assert nothing.returns.shape == (0, 0)
+    assert len(nothing.steps) == 0
+
+
+def test_episodes_of_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reacher's last 50 steps: one after the other, none twice or lost where the process died in the midst of one."""
+    whole = train("bpql", tmp_path / "whole", seed=3, steps=320)
+    episodes = whole.episodes()
+    assert [row["step"] for row in episodes] == [50, 100, 150, 200, 250, 300]
+    assert [row["episode"] for row in episodes] == list(range(6))
+    assert {(row["length"], row["seed"]) for row in episodes} == {(50, 3)}
+    cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, seed=3, steps=320)
+    assert cut.episodes() == episodes
+
+
+def test_returns_of_training_are_sums_of_rewards(tmp_path: Path) -> None:
+    """The random agent's actions are known, so its episodes can be played again."""
+    run = train("random", tmp_path / "run", steps=100, random_steps=100)
+    env = delayrl.make("Reacher-v5", 3, rescale=True)
+    rewards, at = [], iter(range(100))
+
+    for episode in range(2):
+        env.reset(seed=reset_seed(0, TRAINING, episode))
+        total = 0.0
+        for _ in range(50):
+            action = np.random.default_rng([0, RANDOM_ACTIONS, next(at)]).uniform(-1, 1, 2).astype(np.float32)
+            total += float(env.step(action)[1])
+        rewards.append(total)
+    np.testing.assert_allclose([row["return"] for row in run.episodes()], rewards, rtol=1e-6)
+
+
+def test_a_callback_sees_each_evaluation_and_may_stop(tmp_path: Path) -> None:
+    seen = []
+
+    def stop_at_200(step: int, runs: list[Run]) -> bool:
+        seen.append((step, len(runs[0].rows()), runs[0].latest().step))
+        return step == 200
+
+    run = train("bpql", tmp_path / "run", callback=stop_at_200)
+    assert seen == [(100, 2, 100), (200, 4, 200)]
+    assert run.curve().steps.tolist() == [100, 200]
+    assert (run.path / "curve.png").exists()
+    whole = train("bpql", tmp_path / "whole")
+    assert train("bpql", tmp_path / "run").rows() == whole.rows()
+    for name, array in arrays(run).items():
+        np.testing.assert_array_equal(array, arrays(whole)[name])
+
+
+def test_runs_of_a_folder(tmp_path: Path) -> None:
+    """Wherever below it they are; other files named alike are left out."""
+    made = [train("random", tmp_path / name, steps=100, random_steps=100) for name in ("b/deep", "a")]
+    for name, text in (("other", "{}"), ("list", "[1]"), ("broken", "{")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(text)
+    assert delayrl.runs(tmp_path) == [made[1], made[0]]
+    assert delayrl.runs(str(tmp_path / "b")) == [made[0]]
+    with pytest.raises(delayrl.DelayRLError, match="there is no folder"):
+        delayrl.runs(tmp_path / "nowhere")
+
+
+def test_evaluate_takes_a_run_its_folder_or_a_policy(vdpo: Run) -> None:
+    result = delayrl.evaluate(vdpo, episodes=2)
+    assert delayrl.evaluate(str(vdpo.path), episodes=2) == result
+    policy = delayrl.load(vdpo)
+    assert delayrl.evaluate(policy, episodes=2, env="Reacher-v5")["returns"] == result["returns"]
+    assert delayrl.evaluate(policy, episodes=2, env="Reacher-v5", delay=1)["delay"] == 1
+    with pytest.raises(delayrl.DelayRLError, match="a policy does not say what its task is: give env"):
+        delayrl.evaluate(policy)
+
+
+def test_runs_on_the_command_line(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["runs", str(vdpo.path.parent)])
+    head, row = capsys.readouterr().out.splitlines()
+    assert head.split() == ["agent", "preset", "env", "delay", "seed", "steps", "return", "run"]
+    assert row.split()[:6] == ["vdpo", "small", "Reacher-v5", "3", "0", "300"]
+    assert row.split()[6] == f"{vdpo.curve().returns[-1].mean():,.1f}"
+    train("random", tmp_path / "part", steps=200, random_steps=100, callback=lambda step, runs: True)
+    main(["runs", str(tmp_path), "--json"])
+    (part,) = json.loads(capsys.readouterr().out)
+    assert (part["agent"], part["step"], part["steps"]) == ("random", 100, 200)
+
+
+def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Options that differ, by name; intervals where there are seeds; a picture."""
+    train("random", tmp_path / "two", steps=200, random_steps=100, seeds=2)
+    main(["compare", str(vdpo.path), str(tmp_path / "two"), "--out", str(tmp_path / "both.png")])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == f"B  {tmp_path / 'two'} (2 seeds)"
+    options = {line.split()[0]: line.split()[1:] for line in lines[3 : lines.index("", 3)]}
+    assert options["option"] == ["A", "B"]
+    assert options["agent"] == ["vdpo", "random"]
+    assert options["steps"] == ["300", "200"]
+    assert options["width"] == ["8", "-"]
+    assert not {"env", "delay", "seed", "preset"} & options.keys()
+    rows = {line.split()[0]: line for line in lines[lines.index("", 3) + 2 :]}
+    assert f"{vdpo.curve().returns[-1].mean():,.1f}" in rows["A"]
+    assert "[" in rows["B"]
+    assert "[" not in rows["A"]
+    assert (tmp_path / "both.png").stat().st_size > 5000
+    with pytest.raises(SystemExit):
+        main(["compare", str(vdpo.path)])
+    assert capsys.readouterr().err == "delayrl: compare takes two to 8 runs; got 1\n"
+    main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "same.png")])
+    assert "all options  the same  the same" in capsys.readouterr().out
