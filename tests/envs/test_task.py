@@ -269,10 +269,10 @@ def test_code_that_came_with_a_run_folder_is_not_imported(name: str, tmp_path: P
         with pytest.raises(DelayRLError):
             stored_task(f"{name}:Arm", folder)
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "link").symlink_to(tmp_path / "runs")
+    (tmp_path / "elsewhere" / "linked_runs").symlink_to(tmp_path / "runs")
     monkeypatch.chdir(tmp_path / "elsewhere")
     with pytest.raises(DelayRLError, match="could run any code"):
-        stored_task("link.evil:Arm", Path("link") / "mine")
+        stored_task("linked_runs.evil:Arm", Path("linked_runs") / "mine")
     monkeypatch.chdir(folder)
     with pytest.raises(DelayRLError, match="could run any code"):
         stored_task("evil:Arm", Path())

@@ -69,7 +69,7 @@ class Loop:
     def __init__(self, group: Group, state: TrainState, recorder: Recorder) -> None:
         self.group, self.state, self._recorder = group, state, recorder
         self._metrics: Metrics = {}
-        self._ended: list[list[dict[str, Any]]] = [[] for _ in group.runs]  # episodes of each seed, not yet written
+        self._ended: list[list[dict[str, Any]]] = [[] for _ in state.actors]  # episodes of each seed, not yet written
         self._learning = False
         self._began, self._began_step = time.perf_counter(), state.step
 
