@@ -13,7 +13,7 @@ from delayrl.run.folder import Run
 
 def add_options(parser: Parser, words: Sequence[str]) -> None:
     """Add the options of the agent that comes first in `words`, with the defaults of their preset."""
-    from delayrl.agents.registry import find_agent
+    from delayrl.run.agents import find_agent
 
     if not words or words[0].startswith("-"):
         if {"-h", "--help"} & set(words):
@@ -62,7 +62,10 @@ def _add_group(parser: Parser, title: str, config: Any) -> None:
             settings |= Numbers.of(_reader(get_args(option.kind)[0]))
             default = " ".join(map(str, default))
         name = f"--{option.name.replace('_', '-')}"
-        group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+        try:
+            group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+        except argparse.ArgumentError as error:
+            raise DelayRLError(f"the agent has an option {name}, as the command has: give it another name") from error
 
 
 def _reader(kind: Any) -> Any:

@@ -20,6 +20,7 @@ from delayrl.envs import delay_of, make
 from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, load, task_of
+from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run
 
 
@@ -145,6 +146,7 @@ def evaluate(
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
 ) -> dict[str, Any]:
     """Play the policy of a run folder on start states that it never saw.
 
@@ -155,6 +157,7 @@ def evaluate(
         seed: of the start states.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of it, as `load`.
+        agent: as `load`.
 
     Returns:
         agent, env, delay, episodes, mean_return, std_return, returns.
@@ -163,7 +166,8 @@ def evaluate(
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
     config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
-    return _play(load(run, task), config, task, config["delay"] if delay is None else delay, episodes, seed)
+    policy = load(run, task, agent=agent)
+    return _play(policy, config, task, config["delay"] if delay is None else delay, episodes, seed)
 
 
 def sweep(
@@ -173,10 +177,11 @@ def sweep(
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
     config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
-    policy = load(run, task)
+    policy = load(run, task, agent=agent)
     for delay in range(policy.spec.delay + 1):
         yield _play(policy, config, task, delay, episodes, seed)
 

@@ -19,6 +19,7 @@ from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
+from delayrl.run.agents import AgentLike
 from delayrl.run.condition import Condition, Setup, resolve
 from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
@@ -32,7 +33,7 @@ from delayrl.wrappers.single import limit_of
 
 
 def train(
-    agent: str,
+    agent: AgentLike,
     env: TaskLike,
     delay: DelayLike = 0,
     *,
@@ -54,7 +55,7 @@ def train(
     """Train an agent. The same call resumes an unfinished run, and returns a finished one.
 
     Args:
-        agent: its name in the registry (`delayrl agents`).
+        agent: its name (`delayrl agents`), `module:object`, or a class or instance of your own (docs/own-agent.md).
         env: id of a Gymnasium task (`delayrl tasks`), `module:object`, a spec, or a class or function that makes an
             environment.
         delay: environment steps, or a text such as "uniform:1:5@fifo" or "80ms+action=2" (`delayrl.delays`).
@@ -126,10 +127,10 @@ def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
 
 def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[Run]:
     """Return the run folder of each seed: below `out`, or where it is None below runs/."""
-    kind = f"{condition.agent}-{condition.preset}"
+    kind = f"{condition.agent.strip('<>')}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"
-    task = re.sub(r"[^\w.=+@-]+", "-", condition.place)
+    task, kind = (re.sub(r"[^\w.=+@-]+", "-", name) for name in (condition.place, kind))
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
         return [Run(home)]
