@@ -15,11 +15,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from delayrl.agents.registry import find_agent
 from delayrl.envs import make
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
+from delayrl.run.agents import find_agent
 from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
 from delayrl.run.configuration import check_names, options

@@ -51,10 +51,11 @@ def add_wrappers(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--flatten", action="store_true", help="join nested observations to one vector")
 
 
-def add_stored_env(parser: argparse.ArgumentParser) -> None:
-    """Add `--env`, for runs whose folder does not say enough to make their environment."""
+def add_stored(parser: argparse.ArgumentParser) -> None:
+    """Add `--env` and `--agent`, for runs whose folder does not say enough to make these, or may not."""
     words = "what makes the environment (default: what the run names)"
     parser.add_argument("--env", metavar="MODULE:NAME", help=words)
+    parser.add_argument("--agent", metavar="MODULE:NAME", help="the agent (default: what the run names)")
 
 
 def pair(word: str) -> tuple[str, Any]:

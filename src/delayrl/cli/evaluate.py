@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from delayrl.cli.console import add_env_kwargs, add_stored_env, print_table, whole
+from delayrl.cli.console import add_env_kwargs, add_stored, print_table, whole
 from delayrl.errors import DelayRLError
 
 
@@ -19,7 +19,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--sweep", action="store_true", help="play every delay from 0 to the longest, and draw a figure")
     add("--seed", type=whole, default=0, help="seed of the start states (default: 0)")
     add("--json", action="store_true", help="print JSON")
-    add_stored_env(parser)
+    add_stored(parser)
     add_env_kwargs(parser)
 
 
@@ -27,11 +27,11 @@ def run(given: argparse.Namespace) -> None:
     """Play the episodes, and print their returns."""
     from delayrl.play.evaluation import evaluate
 
-    task = {"env": given.env, "env_kwargs": dict(given.env_kwargs)}
+    stored = {"env": given.env, "env_kwargs": dict(given.env_kwargs), "agent": given.agent}
     if given.sweep:
-        _sweep(given, task)
+        _sweep(given, stored)
         return
-    result = evaluate(given.run, given.episodes, given.delay, given.seed, **task)
+    result = evaluate(given.run, given.episodes, given.delay, given.seed, **stored)
     if given.json:
         print(json.dumps(result))
         return
@@ -39,7 +39,7 @@ def run(given: argparse.Namespace) -> None:
     print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}")
 
 
-def _sweep(given: argparse.Namespace, task: dict[str, Any]) -> None:
+def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
     from tqdm import tqdm
 
     from delayrl.play.evaluation import sweep
@@ -48,8 +48,8 @@ def _sweep(given: argparse.Namespace, task: dict[str, Any]) -> None:
 
     if given.delay is not None:
         raise DelayRLError("--sweep plays every delay; leave --delay out")
-    delays = load(given.run, **task).spec.delay + 1
-    played = sweep(given.run, given.episodes, given.seed, **task)
+    delays = load(given.run, **stored).spec.delay + 1
+    played = sweep(given.run, given.episodes, given.seed, **stored)
     results = list(tqdm(played, total=delays, unit="delay", disable=given.json))
     if given.json:
         print(json.dumps(results))

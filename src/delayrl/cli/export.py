@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import add_stored_env
+from delayrl.cli.console import add_stored
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -11,13 +11,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, help="the run folder")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
     parser.add_argument("--force", action="store_true", help="replace an existing bundle")
-    add_stored_env(parser)
+    add_stored(parser)
 
 
 def run(given: argparse.Namespace) -> None:
     """Write the bundle, and print what it holds."""
     from delayrl.deploy.export import export_run
 
-    metadata = export_run(given.run, given.out, force=given.force, env=given.env)
+    metadata = export_run(given.run, given.out, force=given.force, env=given.env, agent=given.agent)
     print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages 0..{metadata['ages'][1]}")
     print(f"  next                     delayrl latency {given.out}")

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from delayrl.cli import agents
-from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored_env, add_wrappers, whole
+from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored, add_wrappers, whole
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import Run
 
 
 def add_options(parser: Parser, words: Sequence[str]) -> None:
     """Add the options of the agent that comes first in `words`, with the defaults of their preset."""
-    from delayrl.agents.registry import AGENTS, find_agent
+    from delayrl.agents.registry import AGENTS
+    from delayrl.run.agents import find_agent
 
     if not words or words[0].startswith("-"):
         if {"-h", "--help"} & set(words):
@@ -55,7 +56,7 @@ def _add_options_of_a_run(parser: Parser, folder: str) -> None:
     parser.prog, parser.description = f"delayrl train {folder}", "Train a run further, with its own options."
     parser.add_argument("run", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--steps", type=whole, required=True, help="the new number of steps, from the run's beginning")
-    add_stored_env(parser)
+    add_stored(parser)
     add_env_kwargs(parser)
     _add_ways(parser)
 
@@ -83,7 +84,10 @@ def _add_group(parser: Parser, title: str, config: Any) -> None:
             settings |= Numbers.of(_reader(get_args(option.kind)[0]))
             default = " ".join(map(str, default))
         name = f"--{option.name.replace('_', '-')}"
-        group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+        try:
+            group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+        except argparse.ArgumentError as error:
+            raise DelayRLError(f"the agent has an option {name}, as the command has: give it another name") from error
 
 
 def _reader(kind: Any) -> Any:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import add_env_kwargs, add_stored_env, whole
+from delayrl.cli.console import add_env_kwargs, add_stored, whole
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -15,7 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=whole, default=0, help="seed of the start state (default: 0)")
     add("--camera", metavar="NAME", help="a camera of the MuJoCo model (default: track, or one that follows the robot)")
     add("--compare", type=Path, metavar="RUN2", help="show a run on the same task beside it, from the same start state")
-    add_stored_env(parser)
+    add_stored(parser)
     add_env_kwargs(parser)
 
 
@@ -23,7 +23,7 @@ def run(given: argparse.Namespace) -> None:
     """Render the episode, and print its length and return."""
     from delayrl.play.video import watch
 
-    task = {"env": given.env, "env_kwargs": dict(given.env_kwargs)}
-    moments = watch(given.run, given.out, given.delay, given.seed, given.camera, given.compare, **task)
+    stored = {"env": given.env, "env_kwargs": dict(given.env_kwargs), "agent": given.agent}
+    moments = watch(given.run, given.out, given.delay, given.seed, given.camera, given.compare, **stored)
     results = (f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
     print(f"{given.out}: {'; beside it '.join(results)}")

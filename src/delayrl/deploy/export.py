@@ -15,13 +15,21 @@ from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayWarning
 from delayrl.play.policy import Policy, restored, task_of
+from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import Run
 from delayrl.run.provenance import versions
 from delayrl.run.rows import check_row
 
 
-def export_run(run: str | Path, out: str | Path, *, force: bool = False, env: TaskLike | None = None) -> dict[str, Any]:
+def export_run(
+    run: str | Path,
+    out: str | Path,
+    *,
+    force: bool = False,
+    env: TaskLike | None = None,
+    agent: AgentLike | None = None,
+) -> dict[str, Any]:
     """Write the policy in the newest good checkpoint of a run folder as a bundle; return its metadata.
 
     Args:
@@ -29,6 +37,7 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False, env: Ta
         out: a new or empty folder.
         force: replace a bundle in `out`.
         env: what makes the run's environment, as `delayrl.load`.
+        agent: as `delayrl.load`.
 
     Raises:
         DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
@@ -37,7 +46,7 @@ def export_run(run: str | Path, out: str | Path, *, force: bool = False, env: Ta
     source = Run(Path(run))
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
     task = task_of(run, env)
-    policy = restored(config, checkpoint, task)
+    policy = restored(source, config, checkpoint, task, agent)
     metadata = describe(source, checkpoint.step, policy.spec.delay, task)
     write_files(Path(out), bundle_files(policy, metadata), force=force)
     return metadata

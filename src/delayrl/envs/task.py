@@ -26,8 +26,9 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation
 
-from delayrl.envs.lookup import find_id, find_object, find_stored, name_of_object, one_line
+from delayrl.envs.lookup import find_id, find_object, find_stored
 from delayrl.errors import DelayRLError
+from delayrl.lookup import name_of_object, one_line, parse_arguments, with_arguments
 
 Env = gym.Env[Any, Any]
 FLATTEN = "flatten"
@@ -59,8 +60,7 @@ class Part:
         return find_object(self.name) if ":" in self.name else find_id(self.name)
 
     def __str__(self) -> str:
-        values = ", ".join(f"{name}={json.dumps(value)}" for name, value in sorted(self.kwargs.items()))
-        return f"{self.name}({values})" if values else self.name
+        return with_arguments(self.name, self.kwargs)
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _parse(text: str) -> Task:
     try:
         while part := re.match(r"\s*\|\s*([^()|]*[^()|\s])\s*(\(?)", rest):
             rest = rest[part.end() :]
-            kwargs, rest = _parse_arguments(rest) if part[2] else ({}, rest)
+            kwargs, rest = parse_arguments(rest) if part[2] else ({}, rest)
             parts.append(Part(part[1], kwargs))
         if parts and not rest:
             return Task(parts[0], tuple(parts[1:]))
@@ -176,18 +176,6 @@ def _parse(text: str) -> Task:
         pass
     example = 'my_module:Arm(gain=2, model="arm.xml") | flatten'
     raise DelayRLError(f"cannot read the task {text!r}; write an id, or e.g. {example}, with values as JSON")
-
-
-def _parse_arguments(text: str) -> tuple[dict[str, Any], str]:
-    """Return keyword arguments, and the text behind the bracket that closes them. Raises ValueError without one."""
-    kwargs = {}
-    while name := re.match(r"[\s,]*(\w+)\s*=\s*", text):
-        kwargs[name[1]], end = json.JSONDecoder().raw_decode(text, name.end())
-        text = text[end:]
-    inside, _, rest = text.partition(")")
-    if inside.strip() or not _:
-        raise ValueError("no closing bracket")
-    return kwargs, rest.strip()
 
 
 def _plain(kwargs: Mapping[str, Any]) -> dict[str, Any]:

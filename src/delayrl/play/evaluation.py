@@ -20,6 +20,7 @@ from delayrl.envs import delay_of, make
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, load, task_of
+from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run, as_run
 
 
@@ -145,6 +146,7 @@ def evaluate(
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
 ) -> dict[str, Any]:
     """Play the policy of a run on start states that it never saw.
 
@@ -155,6 +157,7 @@ def evaluate(
         seed: of the start states.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of it, as `load`.
+        agent: as `load`.
 
     Returns:
         agent, env, delay, episodes, mean_return, std_return, returns.
@@ -168,7 +171,7 @@ def evaluate(
         task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
     else:
         config, task = as_run(run).config, task_of(run, env, env_kwargs)
-        policy, name, usual = load(run, task), config["agent"], config["delay"]
+        policy, name, usual = load(run, task, agent=agent), config["agent"], config["delay"]
     return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
 
@@ -179,10 +182,11 @@ def sweep(
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
     name, task = as_run(run).config["agent"], task_of(run, env, env_kwargs)
-    policy = load(run, task)
+    policy = load(run, task, agent=agent)
     for delay in range(policy.spec.delay + 1):
         yield _play(policy, name, task, delay, episodes, seed)
 

@@ -15,9 +15,9 @@ from delayrl.core.views import seen_now
 from delayrl.envs import make
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
+from delayrl.run.agents import AgentLike, agent_of
 from delayrl.run.arrays import restore_tree
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.condition import agent_of
 from delayrl.run.folder import Run, as_run
 
 
@@ -62,7 +62,13 @@ class Policy:
         return self.low + (action + 1) / 2 * (self.high - self.low)
 
 
-def load(path: str | Path | Run, env: TaskLike | None = None, *, env_kwargs: Mapping[str, Any] | None = None) -> Policy:
+def load(
+    path: str | Path | Run,
+    env: TaskLike | None = None,
+    *,
+    env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
+) -> Policy:
     """Load the policy of a run folder from its newest good checkpoint.
 
     Args:
@@ -70,12 +76,14 @@ def load(path: str | Path | Run, env: TaskLike | None = None, *, env_kwargs: Map
         env: what makes its environment, if the run cannot name it (a lambda) or may not (docs/own-task.md). It gets the
             keyword arguments and wrappers of the run.
         env_kwargs: keyword arguments of the environment that replace or complete the run's.
+        agent: its class, an instance or a name, if the run cannot name it or may not (docs/own-agent.md). It gets the
+            hyperparameters of the run.
 
     Raises:
         DelayRLError: no run folder, no good checkpoint, one of another agent, a task that cannot be made.
     """
     run = as_run(path)
-    return restored(run.config, run.latest(), task_of(run, env, env_kwargs))
+    return restored(run, run.config, run.latest(), task_of(run, env, env_kwargs), agent)
 
 
 def task_of(path: str | Path | Run, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
@@ -84,9 +92,11 @@ def task_of(path: str | Path | Run, env: TaskLike | None = None, env_kwargs: Map
     return stored_task(run.config["env"], run.path, env, env_kwargs)
 
 
-def restored(config: dict[str, Any], checkpoint: Checkpoint, task: Task) -> Policy:
-    """Load the policy in a checkpoint of a run with this configuration, whose task is looked up."""
-    agent = agent_of(config)
+def restored(
+    run: Run, config: dict[str, Any], checkpoint: Checkpoint, task: Task, given: AgentLike | None = None
+) -> Policy:
+    """Load the policy in a checkpoint of a run with this configuration, whose task is looked up; `given` as `load`."""
+    agent = agent_of(config, run.path, given)
     env = make(task, config["delay"])
     spec = spec_of(env)
     state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)

@@ -19,6 +19,7 @@ from delayrl.errors import DelayRLError, first_line
 from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of
+from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run
 
 FASTEST = {".mp4": 60, ".gif": 25}
@@ -45,6 +46,7 @@ def watch(
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
 ) -> list[Moment]:
     """Play an episode of a run's policy, and write it to an .mp4 or .gif file.
 
@@ -59,6 +61,7 @@ def watch(
         compare: a second run on the same task, shown beside the first, from the same start state.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of the environment that replace or complete the run's.
+        agent: as `load`; of both runs if they name the same agent, else of the first.
 
     Returns:
         The last moment of the run's episode, and of that of `compare`.
@@ -82,7 +85,8 @@ def watch(
         titles, episodes = [], []
         for path, config in zip(paths, configs, strict=True):
             task = task_of(path, env, env_kwargs)
-            policy = load(path, task)
+            own = agent if config["agent"] == configs[0]["agent"] else None
+            policy = load(path, task, agent=own)
             served = servable(task, config["delay"] if delay is None else delay, policy.spec)
             played = make(task, served, render_mode="rgb_array")
             stack.callback(close, played)

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.normalised import NormalisedObservations
-from delayrl.agents.registry import Preset, find_agent
+from delayrl.agents.registry import Preset
 from delayrl.core.protocol import Protocol, opening_length
 from delayrl.core.replay import Learnable
 from delayrl.core.types import Spec
@@ -16,6 +16,7 @@ from delayrl.delays import Delay, DelayLike, as_delay, short_label
 from delayrl.envs import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
+from delayrl.run.agents import AgentLike, as_agent, find_agent
 from delayrl.run.configuration import OLDER, check_names, override, values_of
 from delayrl.run.rows import CONDITION
 
@@ -33,7 +34,7 @@ KINDS = CONDITION | {"overrides": dict, "steps": int}
 class Condition:
     """One agent with its hyperparameters, on one task, under one delay and one protocol."""
 
-    agent: str  # its name in the registry
+    agent: str  # its name: in the registry, or what delayrl.run.agents says
     env: str  # the text of the task: an id, or what delayrl.envs.task says
     delay: int | str  # environment steps, or a delay's text
     preset: str = "paper"
@@ -132,12 +133,12 @@ def _digest(parts: Mapping[str, Any]) -> str:
 
 
 def resolve(
-    agent: str, env: TaskLike, delay: DelayLike, preset: str, protocol: str, overrides: Mapping[str, Any]
+    agent: AgentLike, env: TaskLike, delay: DelayLike, preset: str, protocol: str, overrides: Mapping[str, Any]
 ) -> Setup:
     """Resolve what a user gave into a condition and its objects. Raises DelayRLError for what does not exist or fit."""
-    registration = find_agent(agent)
+    name, registration = as_agent(agent)
     if preset not in registration.presets:
-        raise DelayRLError(f"unknown preset {preset!r} of {agent}; there are {', '.join(registration.presets)}")
+        raise DelayRLError(f"unknown preset {preset!r} of {name}; there are {', '.join(registration.presets)}")
     base, chosen = registration.presets[preset], registration.protocol(protocol)
     check_names(overrides, base.agent, base.schedule)
     values = {**chosen.overrides, **overrides}
@@ -150,7 +151,7 @@ def resolve(
         raise DelayRLError(
             f"a run keeps its delay as text, and {str(parsed)[:60]!r} cannot be read back: use delayrl.delays"
         )
-    condition = Condition(agent, str(task), text, preset, protocol, dict(overrides), schedule.steps)
+    condition = Condition(name, str(task), text, preset, protocol, dict(overrides), schedule.steps)
     made = override(base.agent, values)
     if for_run := getattr(made, "for_run", None):
         made = for_run(schedule)
@@ -167,8 +168,13 @@ def following(name: str, preset: Preset, steps: int) -> dict[str, int]:
 
 
 def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a run's configuration that differ from its preset's; none if we do not know the preset."""
+    """Return the options of a run's configuration that differ from its preset's; none if we do not know the preset.
+
+    Nothing is imported because a configuration names it: agents given as `module:object` count as unknown.
+    """
     try:
+        if ":" in config["agent"]:
+            return {}
         registration = find_agent(config["agent"])
         preset, chosen = registration.presets[config["preset"]], registration.protocol(config["protocol"])
     except (KeyError, DelayRLError):
@@ -178,14 +184,3 @@ def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
     implied = {name: value for name, value in OLDER.items() if name in usual}
     options = {**implied, **config["hyperparameters"], **config["schedule"]}
     return {name: value for name, value in options.items() if name not in usual or usual[name] != value}
-
-
-def agent_of(config: Mapping[str, Any]) -> Agent:
-    """Make the agent that a run's configuration describes. Raises DelayRLError for an unknown name."""
-    try:
-        agent = find_agent(config["agent"]).presets[config["preset"]].agent
-    except (KeyError, DelayRLError) as error:
-        raise DelayRLError(f"the run's configuration names an unknown agent or preset: {error}") from error
-    check_names(config["hyperparameters"], agent)
-    agent = override(agent, {**OLDER, **config["hyperparameters"]})
-    return NormalisedObservations(agent) if config["schedule"].get("observation_norm") == "running" else agent

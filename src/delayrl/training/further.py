@@ -5,9 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from delayrl.agents.registry import find_agent
+from delayrl.agents.registry import AGENTS, Registration
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
+from delayrl.run.agents import AgentLike, as_agent, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
 from delayrl.run.folder import Run, as_run, seed_runs
@@ -21,6 +22,7 @@ def go_on(
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: AgentLike | None = None,
     device: str | None = None,
     track: str | None = None,
     threads: int = 1,
@@ -38,6 +40,7 @@ def go_on(
         steps: the new number of environment steps, from the beginning of the run.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of the environment that replace or complete the run's.
+        agent: the agent, as `load`.
         device: as `train`.
         track: as `train`.
         threads: as `train`.
@@ -54,7 +57,9 @@ def go_on(
     folder = as_run(run)
     runs = seed_runs(folder.path)
     configs = [one.config for one in runs]
-    setup = setup_of(configs[0], stored_task(configs[0]["env"], runs[0].path, env, env_kwargs), steps)
+    task = stored_task(configs[0]["env"], runs[0].path, env, env_kwargs)
+    registration = find_agent(configs[0]["agent"], runs[0].path) if agent is None else as_agent(agent).registration
+    setup = setup_of(configs[0], configs[0]["agent"] if agent is None else agent, registration, task, steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     for one, config in zip(runs, configs, strict=True):
@@ -75,24 +80,20 @@ def go_on(
     return runs[0] if folder.exists else runs
 
 
-def setup_of(config: Mapping[str, Any], task: Task, steps: int) -> Setup:
+def setup_of(config: Mapping[str, Any], agent: AgentLike, registration: Registration, task: Task, steps: int) -> Setup:
     """Return the setup of a run with this configuration that is to have `steps` steps."""
     stored = {**config["hyperparameters"], **config["schedule"]}
-    older = {name: value for name, value in OLDER.items() if name in _options(config)}
-    names = config["agent"], task, config["delay"], config["preset"], config["protocol"]
-    setup = resolve(*names, {**older, **stored, "steps": steps})
+    preset = registration.presets[config["preset"]]
+    known = {*values_of(preset.agent), *values_of(preset.schedule)} if config["agent"] in AGENTS else set()
+    older = {name: value for name, value in OLDER.items() if name in known}
+    setup = resolve(
+        agent, task, config["delay"], config["preset"], config["protocol"], {**older, **stored, "steps": steps}
+    )
     origin = dict(config.get("origin", {}))
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]
     setup = replace(setup, origin=origin)
     return replace(setup, condition=replace(setup.condition, overrides=overrides_of(setup.config)))
-
-
-def _options(config: Mapping[str, Any]) -> set[str]:
-    """Return the names of all options that a run of this agent has today."""
-    registration = find_agent(config["agent"])
-    preset = registration.presets[config["preset"]]
-    return {*values_of(preset.agent), *values_of(preset.schedule)}
 
 
 def _check(run: Run, config: Mapping[str, Any], first: Mapping[str, Any], steps: int) -> None:

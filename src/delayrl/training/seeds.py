@@ -28,10 +28,10 @@ def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
 
 def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[Run]:
     """Return the run folder of each seed: below `out`, or where it is None below runs/."""
-    kind = f"{condition.agent}-{condition.preset}"
+    kind = f"{condition.agent.strip('<>')}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"
-    task = re.sub(r"[^\w.=+@-]+", "-", condition.place)
+    task, kind = (re.sub(r"[^\w.=+@-]+", "-", name) for name in (condition.place, kind))
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
         return [Run(home)]

@@ -17,6 +17,7 @@ from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
+from delayrl.run.agents import AgentLike
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup, resolve
 from delayrl.run.folder import Run, as_run
@@ -32,7 +33,7 @@ from delayrl.wrappers.single import limit_of
 
 
 def train(
-    agent: str,
+    agent: AgentLike,
     env: TaskLike,
     delay: DelayLike = 0,
     *,
@@ -57,7 +58,7 @@ def train(
     """Train an agent. The same call resumes an unfinished run, and returns a finished one.
 
     Args:
-        agent: its name in the registry (`delayrl agents`).
+        agent: its name (`delayrl agents`), `module:object`, or a class or instance of your own (docs/own-agent.md).
         env: id of a Gymnasium task (`delayrl tasks`), `module:object`, a spec, or a class or function that makes an
             environment.
         delay: environment steps, or a text such as "uniform:1:5@fifo" or "80ms+action=2" (`delayrl.delays`).

@@ -1,0 +1,122 @@
+"""From names to the code that they stand for, and back; with the errors of that code as one line.
+
+A name is `module:object`, or that of an entry point: an installed package declares it, in a group such as
+`delayrl.agents`, to stand for a `module:object` of its own.
+"""
+
+import contextlib
+import difflib
+import importlib
+import importlib.util
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from delayrl.errors import DelayRLError, described
+
+
+def find_object(name: str) -> Any:
+    """Import what `module:object` names. Raises DelayRLError if there is no such module or object."""
+    source, _, path = name.partition(":")
+    module = find_module(source)
+    found = attribute(module, path)
+    if found is None:
+        near = difflib.get_close_matches(path, vars(module), n=3, cutoff=0.5)
+        hint = f"; did you mean {', '.join(near)}?" if near else ""
+        raise DelayRLError(f"module {source!r} has no {path!r}{hint}")
+    return found
+
+
+def find_module(source: str) -> ModuleType:
+    """Import a module, which may lie in the working folder, as with `python -m`. Raises DelayRLError if that fails."""
+    _search_working_folder()
+    with one_line(f"cannot import {source!r}"):
+        return importlib.import_module(source)
+
+
+def _search_working_folder() -> None:
+    if not sys.flags.safe_path and not {"", os.getcwd()} & set(sys.path):
+        sys.path.insert(0, os.getcwd())
+
+
+def attribute(thing: Any, path: str) -> Any:
+    """Return what a dotted path leads to, or None."""
+    for name in path.split("."):
+        thing = getattr(thing, name, None)
+    return thing
+
+
+def name_of_object(thing: Any) -> str:
+    """Return the `module:object` by which a class or function can be imported, or `<object>` if there is none."""
+    module = getattr(thing, "__module__", None) or "__main__"
+    path = getattr(thing, "__qualname__", type(thing).__name__)
+    if module != "__main__" and attribute(sys.modules.get(module), path) is thing:
+        return f"{module}:{path}"
+    return f"<{path.rpartition('.')[2].strip('<>')}>"
+
+
+def entry_points(group: str) -> dict[str, str]:
+    """Return what installed packages declare in a group: the `module:object` of each name."""
+    return {point.name: point.value.replace(" ", "") for point in metadata.entry_points(group=group)}
+
+
+def public_name(name: str, group: str) -> str:
+    """Return the entry point that stands for a `module:object`, or the name itself: one thing has one name."""
+    return next((short for short, source in entry_points(group).items() if source == name), name)
+
+
+def came_with(name: str, folder: Path) -> bool:
+    """Return whether the module of `module:object` lies in or beside a run folder. Imports nothing."""
+    _search_working_folder()
+    source = name.partition(":")[0]
+    with one_line(f"cannot import {source!r}"):
+        spec = importlib.util.find_spec(source.partition(".")[0])  # of the package
+    places = [spec.origin or "", *(spec.submodule_search_locations or [])] if spec is not None else []
+    return any(Path(place).resolve().is_relative_to(top) for place in places for top in _tops(folder))
+
+
+def _tops(folder: Path) -> Iterator[Path]:
+    """Yield the highest folder below the working folder that holds a run: what was downloaded is not above it."""
+    here = Path.cwd().resolve()
+    for path in (Path(os.path.abspath(folder)), folder.resolve()):  # they differ if one of the folders is a link
+        top = here.joinpath(*path.relative_to(here).parts[:1]) if path.is_relative_to(here) else path
+        yield top.resolve()
+
+
+def with_arguments(name: str, kwargs: Mapping[str, Any]) -> str:
+    """Return `name(argument=value, …)` with values as JSON, or the name alone. Raises TypeError for other values."""
+    values = ", ".join(f"{key}={json.dumps(value)}" for key, value in sorted(kwargs.items()))
+    return f"{name}({values})" if values else name
+
+
+def parse_arguments(text: str) -> tuple[dict[str, Any], str]:
+    """Return the keyword arguments that follow an opening bracket, and the text behind the closing one.
+
+    Raises:
+        ValueError: a value that is not JSON, or no closing bracket.
+    """
+    kwargs = {}
+    while name := re.match(r"[\s,]*(\w+)\s*=\s*", text):
+        kwargs[name[1]], end = json.JSONDecoder().raw_decode(text, name.end())
+        text = text[end:]
+    inside, bracket, rest = text.partition(")")
+    if inside.strip() or not bracket:
+        raise ValueError("no closing bracket")
+    return kwargs, rest.strip()
+
+
+@contextlib.contextmanager
+def one_line(what: str) -> Iterator[None]:
+    """Raise whatever code of the user raises as a DelayRLError: `what`, and the error's own type and message."""
+    try:
+        yield
+    except DelayRLError:
+        raise
+    except (Exception, SystemExit) as error:  # a script without a guard may end the process when it is imported
+        raise DelayRLError(f"{what}: {described(error)}") from error

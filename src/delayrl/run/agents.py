@@ -1,0 +1,149 @@
+"""Agents as users name them: those of the registry, of installed packages, and their own.
+
+An agent's name is that in the registry, that of an entry point in the group `delayrl.agents`, or `module:object` for
+a class, an instance, or a `Registration` that has presets. In Python the class or an instance may be given itself. A
+run keeps the name beside the hyperparameters; what no name leads back to, such as a class in a script, is `<object>`.
+"""
+
+import difflib
+import inspect
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from delayrl.agents.base import Agent, Schedule
+from delayrl.agents.normalised import NormalisedObservations
+from delayrl.agents.registry import AGENTS, Registration, registered
+from delayrl.errors import DelayRLError
+from delayrl.lookup import came_with, entry_points, find_object, name_of_object, one_line, public_name
+from delayrl.run.configuration import OLDER, check_names, options, override, values_of
+
+GROUP = "delayrl.agents"
+AgentLike = str | Agent | type[Agent]
+"""How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
+PARTS = ("privileged", "ahead", "phases", "init", "act", "reference_policy", "deterministic")
+"""What the protocol `Agent` asks for."""
+
+
+class Named(NamedTuple):
+    """An agent with its name."""
+
+    name: str
+    registration: Registration
+
+
+def as_agent(agent: AgentLike) -> Named:
+    """Return the name and the presets of what a user gave. Raises DelayRLError if it is no agent, or unknown."""
+    if isinstance(agent, str):
+        name = public_name(agent, GROUP) if ":" in agent else agent
+        return Named(name, find_agent(name))
+    kind = agent if isinstance(agent, type) else type(agent)
+    name, made = name_of_object(kind), _checked(agent, kind.__name__)
+    if not name.startswith("<") and not _is_made_of(name, made):
+        name = f"<{kind.__name__}>"
+    return Named(public_name(name, GROUP), registered(_summary(made), made))
+
+
+def find_agent(name: str, stored: Path | None = None) -> Registration:
+    """Return the entry of the agent with this name.
+
+    Args:
+        name: in the registry, of an entry point, or `module:object`.
+        stored: the run folder that says so. It may not name code that came with it.
+
+    Raises:
+        DelayRLError: there is none (the message has the nearest names), or what has this name is no agent.
+    """
+    if name in AGENTS:
+        return AGENTS[name]
+    if name.startswith("<"):
+        raise DelayRLError(f"{name} has no name that it could be imported by: give it again, as agent")
+    source = name
+    if ":" not in name:
+        declared = entry_points(GROUP)
+        if name not in declared:
+            near = difflib.get_close_matches(name, [*AGENTS, *declared], n=2, cutoff=0.4) or [*AGENTS, *declared]
+            raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")
+        source = declared[name]
+    if stored is not None and came_with(source, stored):
+        what = f"an agent that could run any code, {source}"
+        raise DelayRLError(f"{stored} came with {what}: if you mean it, give it as agent")
+    found = find_object(source)
+    if isinstance(found, Registration):
+        for preset in found.presets.values():
+            _checked(preset.agent, name)
+        return found
+    made = _checked(found, name)
+    return registered(_summary(made), made)
+
+
+def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = None) -> Agent:
+    """Make the agent that a run's configuration describes.
+
+    Args:
+        config: of the run.
+        folder: of the run, which may not name code that came with it.
+        given: the agent instead, for example where the configuration has no name to import it by. It gets the run's
+            hyperparameters.
+
+    Raises:
+        DelayRLError: an unknown agent, preset or hyperparameter.
+    """
+    registration = find_agent(config["agent"], folder) if given is None else as_agent(given).registration
+    if config["preset"] not in registration.presets:
+        raise DelayRLError(f"the run's configuration names an unknown preset, {config['preset']!r}")
+    agent = registration.presets[config["preset"]].agent
+    check_names(config["hyperparameters"], agent)
+    agent = override(agent, {**(OLDER if config["agent"] in AGENTS else {}), **config["hyperparameters"]})
+    return NormalisedObservations(agent) if config["schedule"].get("observation_norm") == "running" else agent
+
+
+def known_agents() -> dict[str, Registration]:
+    """Return the agents of the registry and of installed packages. One that cannot be loaded says why."""
+    known = dict(AGENTS)
+    for name in sorted(entry_points(GROUP)):
+        try:
+            known[name] = find_agent(name)
+        except DelayRLError as error:
+            known[name] = Registration(f"cannot be loaded: {error}", "-", {})
+    return known
+
+
+def _checked(thing: Any, name: str) -> Agent:
+    """Return an agent: the given one, or one of the given class. Raises DelayRLError if it is none, or not usable."""
+    page = "docs/own-agent.md shows one"
+    lacks = [part for part in PARTS if not hasattr(thing, part) and part not in _field_names(thing)]
+    if not is_dataclass(thing) or lacks:
+        what = f"it lacks {', '.join(lacks)}" if is_dataclass(thing) else "it is no dataclass"
+        raise DelayRLError(f"{name} is no agent, because {what}: {page}")
+    agent: Any = thing
+    if isinstance(thing, type):
+        with one_line(f"agent {name} cannot be made without arguments, so its fields need defaults"):
+            agent = thing()
+    with one_line(f"agent {name} must be a frozen dataclass, with tuples for lists"):
+        hash(agent)
+    with one_line(f"the types of the fields of agent {name} cannot be read"):
+        own = list(options(agent))
+    for option in own:
+        if option.name in values_of(Schedule()):
+            raise DelayRLError(f"agent {name} has an option {option.name}, as every run has: give it another name")
+        option.check(option.default)
+    return agent  # type: ignore[no-any-return]
+
+
+def _field_names(thing: Any) -> set[str]:
+    return {field.name for field in fields(thing)} if is_dataclass(thing) else set()
+
+
+def _is_made_of(name: str, agent: Agent) -> bool:
+    """Return whether the class with this name and the agent's hyperparameters make the agent again."""
+    try:
+        usual = find_agent(name).presets["paper"].agent
+    except DelayRLError:
+        return False
+    return bool(override(usual, values_of(agent)) == agent)
+
+
+def _summary(agent: Agent) -> str:
+    return (inspect.getdoc(type(agent)) or "").partition("\n")[0]

@@ -1,0 +1,94 @@
+"""Agents such as users bring: a class, an instance that its class does not make again, and presets of their own."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from delayrl.agents.base import Deterministic, Phase, Schedule
+from delayrl.agents.registry import Preset, Registration
+from delayrl.core import networks
+from delayrl.core.views import input_size, network_input
+
+
+class State(NamedTuple):
+    actor: Any
+    updates: Any
+
+
+@dataclass(frozen=True)
+class Shrink:
+    """Shrinks its actor by `factor` at each update."""
+
+    width: Annotated[int, "units of the hidden layer"] = 8
+    factor: Annotated[float, "what weights are multiplied by", (0.0, 1.0)] = 0.5
+    batch_size: Annotated[int, "windows per batch"] = 4
+    sees: str = "augmented"
+
+    privileged = False
+
+    def ahead(self, spec):
+        return 1
+
+    def phases(self):
+        return (Phase(50, 1, self.batch_size, self.update),)
+
+    def init(self, spec, key):
+        sizes = (input_size(spec, self.sees), self.width, spec.action_size)
+        return State(networks.mlp_init(key, sizes), jnp.zeros(()))
+
+    def act(self, state, seen, key, *, explore):
+        return jnp.tanh(networks.mlp(state.actor, network_input(seen, self.sees)))
+
+    def update(self, state, windows, key, count):
+        actor = jax.tree.map(lambda weights: self.factor * weights, state.actor)
+        return State(actor, state.updates + 1), {"updates": state.updates}
+
+    def reference_policy(self, state):
+        return None
+
+    def deterministic(self, state):
+        return Deterministic(self.sees, state.actor)
+
+
+WIDE = Shrink(width=16)
+DELAYED = Shrink(sees="delayed")  # `sees` is no option, so the class and the options do not make it again
+ENTRY = Registration("Shrinks, with presets.", "Nobody, 2026", {"tiny": Preset(Shrink(width=2), Schedule(steps=120))})
+
+
+@dataclass(frozen=True)
+class Steps(Shrink):
+    steps: Annotated[int, "is an option of every run"] = 3
+
+
+@dataclass(frozen=True)
+class Seed(Shrink):
+    seed: Annotated[int, "is an option of the command"] = 3
+
+
+@dataclass(frozen=True)
+class Wordy(Shrink):
+    name: Annotated[str, "neither a number nor one of some words"] = "me"
+
+
+@dataclass
+class Thawed:
+    privileged = False
+    ahead = phases = init = act = reference_policy = deterministic = None
+
+
+@dataclass(frozen=True)
+class Needy:
+    width: Annotated[int, "has no default"]
+    privileged = False
+    ahead = phases = init = act = reference_policy = deterministic = None
+
+
+@dataclass(frozen=True)
+class Half:
+    privileged = False
+
+
+def make():
+    return Shrink()

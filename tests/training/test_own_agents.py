@@ -1,0 +1,221 @@
+"""Agents of a user are trained, resumed, evaluated, loaded and exported; in grids and from the command line too."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import delayrl
+import own_agents
+from delayrl.agents.registry import AGENTS
+from delayrl.bench.grid import load_grid
+from delayrl.cli.main import main
+from delayrl.core.types import Spec
+from delayrl.deploy import export_run, load_bundle
+from delayrl.errors import DelayRLError
+from delayrl.play.evaluation import evaluate, sweep
+from delayrl.run.agents import as_agent, find_agent, known_agents
+from delayrl.run.arrays import flatten_tree
+from delayrl.run.condition import overrides_of, resolve
+from delayrl.run.folder import Run
+from own_agents import Shrink
+from own_tasks import make_arm, write_module
+from short_runs import arrays
+
+SHORT: dict[str, Any] = {"steps": 250, "random_steps": 100, "replay_capacity": 100, "evaluate_every": 250}
+SHORT |= {"evaluation_episodes": 2, "preset": "small", "progress": False}
+
+
+@pytest.fixture(autouse=True)
+def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking for modules in the working folder changes the path for good."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+def train(agent: Any, out: Path, **values: Any) -> Run:
+    return delayrl.train(agent, make_arm, 3, out=out, **{**SHORT, **values})
+
+
+def declare(folder: Path, group: str, **points: str) -> None:
+    """Write into a folder what an installed package says of its entry points."""
+    home = folder / f"{group.replace('.', '_')}-1.0.dist-info"
+    home.mkdir()
+    (home / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {group.replace('.', '_')}\nVersion: 1.0\n")
+    lines = [f"{name} = {source}" for name, source in points.items()]
+    (home / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))
+
+
+# ------------------------------------------------------------------------------------------------ with a name
+
+
+def test_a_run_names_its_agent(tmp_path: Path) -> None:
+    """Instance, class and text are one condition; updates at 100, 150, 200 and 250 leave a sixteenth of the weights."""
+    run = train(Shrink(width=4), tmp_path / "run")
+    assert run.config["agent"] == "own_agents:Shrink"
+    assert run.config["hyperparameters"] == {"width": 4, "factor": 0.5, "batch_size": 4}
+    assert {row["agent"] for row in run.read("rows")} == {"own_agents:Shrink"}
+    begun = flatten_tree(Shrink(width=4).init(Spec(1, 1, 3), jax.random.key(0)))
+    assert float(arrays(run)["updates"]) == 4
+    for name in begun.keys() - {"updates"}:
+        np.testing.assert_allclose(arrays(run)[name], begun[name] / 16)
+    assert train("own_agents:Shrink", tmp_path / "run", width=4).path == run.path
+    assert train(Shrink, tmp_path / "run", width=4).path == run.path
+    with pytest.raises(DelayRLError, match="holds a run with another width"):
+        train(Shrink(width=5), tmp_path / "run")
+    ids = [
+        resolve(agent, make_arm, 3, "small", "corrected", {}).cell_id([0])
+        for agent in (Shrink(width=4), replace(own_agents.WIDE, width=4), Shrink)
+    ]
+    assert ids[0] == ids[1] != ids[2]
+    policy = delayrl.load(run.path)
+    assert policy.agent == Shrink(width=4)
+    assert len(evaluate(run.path, 2)["returns"]) == 2
+
+
+def test_an_instance_and_presets_by_name(tmp_path: Path) -> None:
+    """The name of an instance stands for it; those of a `Registration` are its presets."""
+    setup = resolve("own_agents:DELAYED", make_arm, 3, "paper", "corrected", {"factor": 1})
+    assert setup.agent == replace(own_agents.DELAYED, factor=1.0)
+    assert setup.config["agent"] == "own_agents:DELAYED"
+    assert resolve("own_agents:ENTRY", make_arm, 3, "tiny", "corrected", {}).schedule.steps == 120
+    with pytest.raises(DelayRLError, match="unknown preset 'small' of own_agents:ENTRY; there are tiny"):
+        resolve("own_agents:ENTRY", make_arm, 3, "small", "corrected", {})
+    usual, small = find_agent("own_agents:WIDE").presets["matched"], AGENTS["bpql"].presets["small"]
+    assert usual == (own_agents.WIDE, AGENTS["bpql"].presets["matched"].schedule)
+    assert find_agent("own_agents:WIDE").presets["small"].schedule == small.schedule
+
+
+def test_an_agent_without_a_name_is_given_again(tmp_path: Path, capsys) -> None:
+    """Also one whose class and options do not make it again: here `sees` is no option."""
+    run = train(own_agents.DELAYED, tmp_path / "run", width=4)
+    assert run.config["agent"] == "<Shrink>"
+    assert train(own_agents.DELAYED, tmp_path / "run", width=4).path == run.path
+    for call in (delayrl.load, evaluate, lambda path: list(sweep(path)), lambda path: export_run(path, tmp_path / "b")):
+        with pytest.raises(DelayRLError, match="<Shrink> has no name that it could be imported by: give it again, as"):
+            call(run.path)
+    policy = delayrl.load(run.path, agent=own_agents.DELAYED)
+    assert policy.agent == replace(own_agents.DELAYED, width=4)
+    returns = evaluate(run.path, 2, agent=own_agents.DELAYED)["returns"]
+    assert next(iter(sweep(run.path, 2, agent=own_agents.DELAYED)))["episodes"] == 2
+    main(["evaluate", str(run.path), "--episodes", "2", "--json", "--agent", "own_agents:DELAYED"])
+    assert json.loads(capsys.readouterr().out)["returns"] == returns
+    metadata = export_run(run.path, tmp_path / "bundle", agent=own_agents.DELAYED)
+    assert metadata["agent"] == "<Shrink>"
+    info = {"age": 1, "actions": np.full((3, 1), 0.5)}
+    action = load_bundle(tmp_path / "bundle")(np.ones(1), info["actions"], 1)
+    np.testing.assert_allclose(action, policy.act(np.ones(1), info), atol=1e-6)
+
+
+def test_from_the_command_line(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Its hyperparameters are options with their help; the default folder has a name that any system takes."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(["train", "own_agents:Shrink", "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "Shrinks its actor by `factor` at each update." in out
+    assert "--factor VALUE what weights are multiplied by (default: 0.5)" in out
+    words = ["--env", "own_tasks:make_arm", "--delay", "3", "--preset", "small", "--quiet", "--width", "4"]
+    words += [f"--{name.replace('_', '-')}={value}" for name, value in SHORT.items() if isinstance(value, int)][:5]
+    main(["train", "own_agents:Shrink", *words])
+    (run,) = Path("runs").glob("*/*/*")
+    assert str(run) == "runs/own_tasks-make_arm-delay3/own_agents-Shrink-small/seed0"
+    assert Run(run).config["hyperparameters"]["width"] == 4
+
+
+def test_in_a_grid(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("""
+agents = ["own_agents:Shrink", "random"]
+tasks = ["own_tasks:make_arm"]
+delays = [3]
+preset = "small"
+[overrides]
+width = 5
+[overrides."own_agents:Shrink"]
+factor = 0.25
+""")
+    own, random = load_grid(file).cells
+    assert own.condition.overrides == {"width": 5, "factor": 0.25}
+    assert random.condition.overrides == {}
+    assert own.id == resolve(Shrink(5, 0.25), make_arm, 3, "small", "corrected", {}).cell_id([0])
+    file.write_text(file.read_text().replace("factor", "fractor"))
+    with pytest.raises(DelayRLError, match="unknown hyperparameter 'fractor'; did you mean factor"):
+        load_grid(file)
+
+
+# ------------------------------------------------------------------------------------------------ entry points
+
+
+def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
+    """One agent has one name, however it is given; one that cannot be loaded is listed with the reason."""
+    declare(tmp_path, "delayrl.agents", shrink="own_agents:Shrink", gone="own_agents:Gone", sac="own_agents:Shrink")
+    monkeypatch.syspath_prepend(tmp_path)
+    for agent in ("shrink", "own_agents:Shrink", Shrink, Shrink(width=4)):
+        assert as_agent(agent).name == "shrink"
+    assert find_agent("shrink").presets["small"].agent == Shrink()
+    assert find_agent("sac") is AGENTS["sac"]
+    assert [*known_agents()] == [*AGENTS, "gone", "shrink"]
+    main(["agents"])
+    lines = capsys.readouterr().out.splitlines()
+    assert "gone            cannot be loaded: module 'own_agents' has no 'Gone'" in " ".join(lines)
+    assert any(line.startswith("shrink ") and "Shrinks its actor" in line for line in lines)
+    with pytest.raises(DelayRLError, match="unknown agent 'shrnik'; did you mean shrink"):
+        find_agent("shrnik")
+    config = resolve("shrink", make_arm, 3, "small", "corrected", {"width": 3}).config
+    assert overrides_of(json.loads(json.dumps(config))) == {"width": 3}
+
+
+# ------------------------------------------------------------------------------------------------ errors
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("own_agents:make", "own_agents:make is no agent, because it is no dataclass"),
+        ("own_agents:Shrunk", "module 'own_agents' has no 'Shrunk'; did you mean Shrink"),
+        ("own_agents:Half", "because it lacks ahead, phases, init, act, reference_policy, deterministic"),
+        ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
+        ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
+        ("own_agents:Steps", "has an option steps, as every run has"),
+        ("own_agents:Wordy", "name must be a number; got 'me'"),
+        ("not_there:Agent", "cannot import 'not_there': ModuleNotFoundError"),
+        ("os:system", "os:system is no agent"),
+    ],
+)
+def test_what_is_no_agent(name: str, words: str) -> None:
+    with pytest.raises(DelayRLError, match=words) as error:
+        find_agent(name)
+    assert "\n" not in str(error.value)
+
+
+def test_an_option_of_the_command_is_refused(capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "own_agents:Seed", "--env", "Reacher-v5"])
+    line = "delayrl: the agent has an option --seed, as the command has: give it another name\n"
+    assert capsys.readouterr().err == line
+
+
+# ------------------------------------------------------------------------------------------------ stored runs
+
+
+def test_code_that_came_with_a_run_is_not_imported(tmp_path: Path, monkeypatch) -> None:
+    """Nor is anything imported because rows of a report name it; whoever means it gives the agent."""
+    monkeypatch.chdir(tmp_path)
+    run = train(Shrink, Path("runs/mine"))
+    witness = tmp_path / "witness"
+    write_module(tmp_path / "runs", "evil", f"open({str(witness)!r}, 'w')\nfrom own_agents import Shrink")
+    for name in ("runs.evil:Shrink", "os:system", "pathlib:Path"):
+        config = {**run.config, "agent": name}
+        (run.path / "config.json").write_text(json.dumps(config))
+        assert overrides_of(config) == {}
+        with pytest.raises(DelayRLError, match=r"came with an agent that could run any code|is no agent"):
+            delayrl.load(run.path)
+        assert delayrl.load(run.path, agent=Shrink).agent == Shrink()
+    assert not witness.exists()
+    with pytest.raises(DelayRLError, match="unknown hyperparameter 'width'"):
+        delayrl.load(run.path, agent="bpql")
