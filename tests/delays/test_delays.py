@@ -153,9 +153,10 @@ def test_a_sensor_at_any_phase(text: str, step: float | None, plain: str) -> Non
 def test_ages_at_any_phase_by_counting(jitter: int) -> None:
     """Delays in 64ths of a step: rounded ages of all observations that may be the newest at a decision."""
     for delay in range(0, 200, 4):
-        # a decision at 0 uses what was made more than delay, and less than a step more than delay + jitter, ago
-        ages = {-math.floor(-ago / 128 + 0.5) for ago in range(2 * delay, 2 * (delay + jitter + 64))}
-        assert any_phase(delay / 64, (delay + jitter) / 64) == (min(ages), max(ages))
+        # a decision at 0 uses what was made at least delay, and less than delay + jitter + period, ago
+        for period in (8, 64, 80):
+            ages = {-math.floor(-ago / 128 + 0.5) for ago in range(2 * delay, 2 * (delay + jitter + period))}
+            assert any_phase(delay / 64, (delay + jitter) / 64, period / 64) == (min(ages), max(ages))
 
 
 def test_recorded_goes_on_in_order_from_a_random_place() -> None:

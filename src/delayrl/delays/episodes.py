@@ -62,16 +62,17 @@ class Sum:
         return replace(self, law=self.law.shifted(steps))
 
 
-def any_phase(shortest: float, longest: float) -> tuple[int, int]:
+def any_phase(shortest: float, longest: float, period: float = 1.0) -> tuple[int, int]:
     """Return the shortest and the longest age of an observation whose sensor is not in step with the control loop.
 
-    A new observation comes once in a step, at any time between two decisions, and is used until the next has arrived.
-    At a decision the newest was therefore made between `shortest` and one step more than `longest` ago. Its age counts
+    An observation is made at any time between two decisions, and is used until the next has arrived. At a decision the
+    newest was therefore made between `shortest` and `longest + period` ago. Its age counts
     from the decision nearest to that (`delayrl.deploy.Controller`), so it is rounded to the nearest whole step.
 
     Args:
         shortest: the least travel time, in steps, which need not be whole.
         longest: the largest travel time.
+        period: of the sensor, in steps.
 
     Raises:
         DelayRLError: a negative travel time, or one that is not finite.
@@ -79,7 +80,7 @@ def any_phase(shortest: float, longest: float) -> tuple[int, int]:
     if not 0 <= shortest <= longest < math.inf:
         raise DelayRLError(f"a delay and its jitter are finite and not negative; got {shortest:g} to {longest:g} steps")
     # half a step is rounded towards the younger age; a millionth of a step is rounding error
-    return max(0, math.ceil(shortest - 0.5 - 1e-6)), math.ceil(longest + 0.5 - 1e-6)
+    return max(0, math.ceil(shortest - 0.5 - 1e-6)), math.ceil(longest + period - 0.5 - 1e-6)
 
 
 def unsynchronised(delay: float, jitter: float = 0.0) -> DelayLaw:

@@ -2,6 +2,7 @@
 
 import heapq
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from delayrl.delays import any_phase, as_delay
 from delayrl.deploy import Controller
+from delayrl.measure import from_log
 
 DT = 1 / 32
 """Times are multiples of 1/4096 s, which floating point holds exactly."""
@@ -84,3 +86,30 @@ def test_jitter_of_messages_and_of_the_loop(delay: int, jitter: int, late: int) 
     played = [play(longest, phase, delay, jitter, late) for phase in range(0, 128, 5)]
     assert [statistics.overruns for statistics, _ in played] == [0] * len(played)
     assert max(itertools.chain(*(seen for _, seen in played))) in (longest - 1, longest)
+
+
+@pytest.mark.parametrize(("delay", "jitter"), [(256, 0), (200, 60), (90, 200)])
+def test_what_measure_recommends(delay: int, jitter: int, tmp_path: Path) -> None:
+    """From a log with the stamps of such a sensor: trained with that, no decision is an overrun at any phase."""
+    made = DT * np.arange(400)
+    arrived = made + (delay + jitter * (np.arange(400) % 2)) * TICK
+    (tmp_path / "log.csv").write_text(
+        "stamp,received\n" + "".join(f"{m},{a}\n" for m, a in zip(made, arrived, strict=True))
+    )
+    recommended = from_log(tmp_path / "log.csv", DT).train_with
+    assert recommended == as_delay(f"{delay / 128}~{jitter / 128}").plain()
+    longest = as_delay(recommended).maximum
+    played = [play(longest, phase, delay, jitter)[0].overruns for phase in range(0, 128, 5)]
+    assert played == [0] * len(played)
+
+
+def test_the_delays_that_a_policy_serves() -> None:
+    """What it says is what any_phase asks for: two ticks more are an overrun at some phase."""
+    in_step, any_of = "from a sensor in step with the control loop", "at any phase"
+    controller = Controller(Ages(3), stamps="seconds", action_delay=1)
+    assert controller.serves == f"observations up to 62.5 ms late {in_step}, up to 46.88 ms late {any_of}"
+    assert any_phase(0, 1.5)[1] == 2 < any_phase(0, 1.5 + 1 / 128)[1]
+    assert Controller(Ages(3)).serves == f"observations up to 3 steps late {in_step}, up to 2.5 steps late {any_of}"
+    assert "none at another phase" in Controller(Ages(1), action_delay=1).serves
+    for delay, overrun in ((320, False), (322, True)):  # 320 ticks are 2.5 steps
+        assert any(play(3, phase, delay)[0].overruns for phase in range(128)) == overrun
