@@ -8,6 +8,7 @@ from delayrl.delays import (
     Choice,
     Constant,
     Delay,
+    PerEpisode,
     Recorded,
     gamma,
     gilbert_elliott,
@@ -27,6 +28,10 @@ def choices(draw: st.DrawFn) -> Choice:
     return Choice(tuple(steps), tuple((weights / weights.sum()).tolist()))
 
 
+EPISODES = st.one_of(
+    choices().map(PerEpisode),
+    st.builds(gilbert_elliott, STEPS, STEPS, CHANCE, CHANCE).map(PerEpisode),
+)
 LAWS = st.one_of(
     STEPS.map(Constant),
     choices(),
@@ -36,6 +41,7 @@ LAWS = st.one_of(
     st.builds(gilbert_elliott, STEPS, STEPS, CHANCE, CHANCE),
     st.builds(random_walk, STEPS, CHANCE),
     st.lists(STEPS, min_size=1, max_size=60).map(lambda steps: Recorded(tuple(steps))),
+    EPISODES,
 )
 CHANNELS = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "raw", "wait"]))
 ORDERED = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "wait"]))

@@ -17,23 +17,23 @@ from delayrl.core import replay as ring
 from delayrl.core.protocol import OFFICIAL
 from delayrl.core.types import Spec
 from delayrl.core.views import view
-from delayrl.delays import Channel, Constant, Delay, as_delay
+from delayrl.delays import Channel, Constant, Delay, DelayLaw, as_delay
 from delayrl.play.evaluation import evaluate
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
 from delayrl.training.loop import hidden_steps
 from short_runs import arrays, killed_and_resumed, train
-from strategies import CHANNELS
+from strategies import CHANNELS, EPISODES
 
 DELAYED = [name for name in TINY if name != "sac"]
-STOCHASTIC = "uniform:1:3@raw"
+STOCHASTIC, OF_EPISODES = "uniform:1:3@raw", "1+action=episode:choice:0=0.5,2=0.5"
 
 
 @settings(max_examples=15, deadline=None)
-@given(CHANNELS, st.integers(0, 2), st.integers(0, 99))
-def test_round_trip(channel: Channel, lag: int, seed: int) -> None:
+@given(CHANNELS, st.one_of(st.integers(0, 2).map(Constant), EPISODES), st.integers(0, 99))
+def test_round_trip(channel: Channel, lag: DelayLaw, seed: int) -> None:
     """What the wrapper showed is what `view` makes of the replay, now and k steps later, for every law and rule."""
-    delay = Delay(channel, Channel(Constant(lag))).observed()
+    delay = Delay(channel, Channel(lag)).observed()
     longest = delay.maximum
     transitions, shown = record("delayrl/Counter-v0", delay, 90, seed)
     replay = ring.init(Spec(2, 1, longest), 200)
@@ -57,10 +57,12 @@ def test_round_trip(channel: Channel, lag: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", DELAYED)
-def test_every_agent_learns_under_random_delays(name: str) -> None:
-    """Some updates of each agent on raw, unordered ages: all finite, and the parameters move."""
-    agent, longest = TINY[name], as_delay(STOCHASTIC).maximum
-    transitions, shown = record("Reacher-v5", STOCHASTIC, 120)
+@pytest.mark.parametrize("delay", [STOCHASTIC, pytest.param(OF_EPISODES, marks=pytest.mark.thorough)])
+def test_every_agent_learns_under_random_delays(name: str, delay: str) -> None:
+    """Some updates on raw, unordered ages, or on another age in each episode: all finite, and the parameters move."""
+    agent, observed = TINY[name], as_delay(delay).observed()
+    longest = observed.maximum
+    transitions, shown = record("Reacher-v5", observed, 170)
     assert {int(s.age) for s in shown} == {0, 1, 2, 3}
     program = Program(agent, Spec(10, 2, longest))
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
@@ -87,9 +89,11 @@ def test_what_may_be_missing_is_hidden(delay: str, longest: int) -> None:
 
 
 @pytest.mark.thorough
-def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "delay", ["uniform:0:2@fifo+action=1+reward=2", "episode:0:2+action=episode:0:2+reward=episode:0:3"]
+)
+def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, delay: str) -> None:
     """Travel times come back with the episode: the same rows and parameters as uninterrupted."""
-    delay = "uniform:0:2@fifo+action=1+reward=2"
     whole = train("a-sac", tmp_path / "whole", delay=delay)
     assert whole.config["delay"] == delay
     assert {row["delay"] for row in whole.read("rows")} == {delay}
@@ -119,6 +123,18 @@ def test_a_recorded_delay_needs_its_file_only_once(tmp_path: Path) -> None:
     assert delayrl.load(run.path).spec.delay == 3
     assert np.isfinite(evaluate(run.path, 2)["mean_return"])
     assert len(run.read("rows")[0]["delay"]) < 40
+
+
+@pytest.mark.parametrize("agent", ["vdpo", "dida"])
+def test_train_and_evaluate_a_delay_of_each_episode(agent: str, tmp_path: Path) -> None:
+    """Each start state under the delay of its seed: the return is that under this delay alone."""
+    run = train(agent, tmp_path / "run", delay="action=episode:1:3")
+    assert run.config["delay"] == "0+action=episode:1:3"
+    assert all(np.isfinite(row["return"]) for row in run.read("rows"))
+    returns = evaluate(run.path, 8)["returns"]
+    alone = [evaluate(run.path, 8, f"action={lag}")["returns"] for lag in (1, 2, 3)]
+    lags = {column.index(own) for own, *column in zip(returns, *alone, strict=True)}
+    assert len(lags) > 1
 
 
 def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

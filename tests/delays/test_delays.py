@@ -1,5 +1,6 @@
 """Delay laws, channels and their text form; bad ones are refused in one line."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,12 @@ from delayrl.delays import (
     Choice,
     Constant,
     Delay,
+    DelayLaw,
     DelayLike,
     Markov,
+    PerEpisode,
     Recorded,
+    any_phase,
     as_delay,
     gamma,
     gilbert_elliott,
@@ -93,6 +97,66 @@ def test_bursts() -> None:
     steps = np.abs(np.diff(drawn(random_walk(9, 0.5), 20_000)))
     assert set(steps) == {0, 1}
     assert steps.mean() == pytest.approx(0.5 * 0.9, abs=0.02)  # at 2 of 10 states half of the moves are not taken
+
+
+def test_of_each_episode() -> None:
+    """The first message draws, by the law inside; the others repeat it."""
+    inner = gilbert_elliott(1, 6, 0.05, 0.3)
+    first = []
+    for seed in range(4000):
+        values = drawn(PerEpisode(inner), 20, seed)
+        assert len(set(values)) == 1
+        assert values[0] == inner.draw(0, np.random.default_rng(seed))[0]
+        first.append(values[0])
+    assert np.mean(np.array(first) == 6) == pytest.approx(1 / 7, abs=0.02)
+    assert drawn(PerEpisode(PerEpisode(uniform(2, 4))), 9) == drawn(PerEpisode(uniform(2, 4)), 9)
+
+
+@pytest.mark.parametrize(
+    ("text", "law", "written"),
+    [
+        ("episode:2:4", uniform(2, 4), "episode:2:4"),
+        ("episode:uniform:2:4", uniform(2, 4), "episode:2:4"),
+        ("episode:0.05s:120ms", uniform(2, 3), "episode:2:3"),
+        ("episode:choice:1=0.5,80ms=0.5", Choice((1, 2), (0.5, 0.5)), "episode:choice:1=0.5,2=0.5"),
+        ("episode:walk:3", random_walk(3), "episode:walk:3"),
+        ("episode:recorded:3,1,", Recorded((3, 1)), "episode:recorded:3,1,"),
+        ("episode:3", Constant(3), "episode:3"),
+    ],
+)
+def test_texts_of_episodes(text: str, law: DelayLaw, written: str) -> None:
+    delay = as_delay(f"{text}@fifo+action={text}", 0.04)
+    assert delay.observation == Channel(PerEpisode(law), "fifo")
+    assert str(delay) == f"{written}@fifo+action={written}"
+    assert as_delay(str(delay)) == delay
+
+
+@pytest.mark.parametrize(
+    ("text", "step", "plain"),
+    [
+        ("80ms~", 0.04, "episode:2:3"),
+        ("2~", None, "episode:2:3"),
+        ("92ms~", 0.04, "episode:2:3"),  # 2.3 steps
+        ("104ms~", 0.04, "episode:3:4"),  # 2.6 steps
+        ("100ms~", 0.04, "episode:2:3"),
+        ("0~", None, "episode:0:1"),
+        ("80ms~12ms", 0.04, "uniform:2:3"),  # up to 2.3 steps
+        ("80ms~24ms", 0.04, "uniform:2:4"),
+        ("0.08s~0.08s@fifo+action=1~", 0.04, "uniform:2:5@fifo+action=episode:1:2"),
+    ],
+)
+def test_a_sensor_at_any_phase(text: str, step: float | None, plain: str) -> None:
+    assert as_delay(text, step).plain() == plain
+
+
+@pytest.mark.parametrize("jitter", [0, 1, 24, 32, 40])
+def test_ages_at_any_phase_by_counting(jitter: int) -> None:
+    """Delays in 64ths of a step: rounded ages of all observations that may be the newest at a decision."""
+    for delay in range(0, 200, 4):
+        # a decision at 0 uses what was made at least delay, and less than delay + jitter + period, ago
+        for period in (8, 64, 80):
+            ages = {-math.floor(-ago / 128 + 0.5) for ago in range(2 * delay, 2 * (delay + jitter + period))}
+            assert any_phase(delay / 64, (delay + jitter) / 64, period / 64) == (min(ages), max(ages))
 
 
 def test_recorded_goes_on_in_order_from_a_random_place() -> None:
@@ -194,6 +258,15 @@ def test_channels_of_a_text() -> None:
         ("recorded:nowhere.csv", "No such file"),
         ("recorded:a+b@c.csv", "a\\+b@c.csv"),
         ("recorded", "takes values after a colon"),
+        ("episode", "takes values after a colon"),
+        ("-1~", "not negative"),
+        ("1~-1", "not negative"),
+        ("80ms~", "no `dt`"),
+        ("1~soon", "is not a number"),
+        ("episode:4:2", "LOW ≤ HIGH"),
+        ("episode:-1:3", "negative"),
+        ("episode:1:2:3", "takes 2 values"),
+        ("episode:soon", "is not a number"),
         ("recorded:" + "9" * 5000 + ",", "No such file|too long"),
         ("1e400", "is not a number|finite|whole"),
         ("gamma:1e-200:1:5", "between"),
@@ -275,6 +348,21 @@ def test_values_that_are_no_delay() -> None:
             as_delay(given_)  # type: ignore[arg-type]
     with pytest.raises(DelayRLError, match="constant delay"):
         as_delay("action=uniform:0:3").observed()
+
+
+def test_actions_of_each_episode_are_observed_late() -> None:
+    assert as_delay("2+action=episode:1:3").observed() == as_delay("episode:3:5")
+    assert as_delay("uniform:0:2@wait+action=episode:1:3").observed() == as_delay("episode:3:5")
+    assert as_delay("2+action=episode:1:3@wait").observed() == as_delay(5)
+    both = as_delay("gilbert:0:4:0.3:0.3@fifo+action=episode:1:3").observed().observation
+    assert (both.maximum, both.rule) == (7, "fifo")
+    offsets = set()
+    for seed in range(40):
+        values = np.array(drawn(both.law, 60, seed))
+        assert set(values - values.min()) == {0, 4}
+        np.testing.assert_array_equal(drawn(both.law.shifted(2), 60, seed), values + 2)
+        offsets.add(int(values.min()))
+    assert offsets == {1, 2, 3}
 
 
 def test_laws_take_arrays() -> None:

@@ -35,7 +35,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_a_run_becomes_a_bundle(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bundle"
     main(["export", str(run), "--out", str(out)])
-    assert "vdpo on Reacher-v5, ages 0..3" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "vdpo on Reacher-v5, ages 0..3" in printed
+    assert "up to 60 ms late from a sensor in step with the control loop, up to 50 ms late at any phase" in printed
     assert sorted(file.name for file in out.iterdir()) == ["bundle.json", "policy.onnx", "policy.safetensors"]
     assert not [file for file in tmp_path.iterdir() if file != out]
     metadata = load_bundle(out).metadata

@@ -358,7 +358,8 @@ def test_dead_time_of_plants(plant: str, policy: bool, tmp_path: Path) -> None:
         e = from_log(log(tmp_path / "log.csv", *signals(plant, delay, noise=noise, policy=policy)))
         assert e.delay == pytest.approx(delay * ROW)
         assert e.low <= delay * ROW <= e.high
-        assert (e.train_with, e.step) == (str(delay), delay)
+        assert (e.in_step, e.step) == (str(delay), delay)
+        assert e.train_with == f"episode:{delay}:{delay + 2}"  # the dead time is known to a row
         assert e.strength > 1
 
 
@@ -418,12 +419,12 @@ def test_columns_units_and_recordings(tmp_path: Path) -> None:
 def test_a_delay_that_drifts_and_a_cold_start(tmp_path: Path) -> None:
     e = from_log(log(tmp_path / "log.csv", *signals("servo", lambda t: 3 + 3 * (t > 2100), 4000)))
     assert [round(d / ROW) for _, d in e.windows] == [3, 3, 3, 3, 6, 6, 6, 6]
-    assert e.train_with == "uniform:3:6"
+    assert (e.train_with, e.in_step) == ("uniform:3:8", "uniform:3:6")
     e.save(tmp_path / "steps.txt")
     assert (tmp_path / "steps.txt").read_text().split() == ["3"] * 4 + ["6"] * 4
     cold = signals("servo", lambda t: 20 - min(t, 100) // 6, 3000)
     e = from_log(log(tmp_path / "log.csv", *cold))
-    assert (e.delay, e.train_with) == (pytest.approx(4 * ROW), "4")
+    assert (e.delay, e.in_step) == (pytest.approx(4 * ROW), "4")
 
 
 def test_period_and_rounding(tmp_path: Path) -> None:
@@ -448,9 +449,11 @@ def test_stamps_are_exact(tmp_path: Path) -> None:
     left_out = 1000 - e.rows
     assert 40 <= left_out <= 60
     assert e.counts == dict(sorted(Counter(steps[left_out:].tolist()).items()))
-    assert (e.method, e.train_with, e.slowest_warm_up) == ("stamps", "uniform:3:5", pytest.approx(0.6, abs=1e-5))
+    assert (e.method, e.in_step, e.slowest_warm_up) == ("stamps", "uniform:3:5", pytest.approx(0.6, abs=1e-5))
     assert from_log(write(tmp_path / "log.csv", columns), warm_up=0).longest == pytest.approx(0.6, abs=1e-5)
-    assert from_log(tmp_path / "log.csv", 0.1).train_with == "1"
+    assert from_log(tmp_path / "log.csv", 0.1).in_step == "1"
+    recommended = [from_log(tmp_path / "log.csv", period).train_with for period in (ROW, 0.05, 0.1)]
+    assert recommended == ["uniform:3:6", "uniform:1:2", "1"]  # made up to 100 + 20 ms ago, rounded
     columns["received"] = made + 0.05 + 1e-3 * (made - made[0])  # a clock that gains 1 ms a second
     assert from_log(write(tmp_path / "log.csv", columns)).drift == pytest.approx(1000, rel=0.01)
 
@@ -468,7 +471,7 @@ def test_simulated_robot(tmp_path: Path) -> None:
         obs, *_ = env.step(action)
     names = ["time", *(f"action_{i}" for i in range(6)), *(f"observation_{i}" for i in range(17))]
     e = from_log(write(tmp_path / "log.csv", dict(zip(names, np.array(rows).T, strict=True))))
-    assert (e.train_with, e.delay) == ("4", pytest.approx(4 * 0.05))
+    assert (e.in_step, e.delay) == ("4", pytest.approx(4 * 0.05))
     assert sorted(probe(env, episodes=1).total) == [4]
 
 
@@ -482,7 +485,7 @@ def test_parquet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vectors = {"action": [[a, 0.0] for a in u], "observation.state": [[b, 1.0] for b in y]}
     parquet.write_table(pyarrow.table({"timestamp": ROW * np.arange(len(u)), **vectors}), path)
     e = from_log(path)
-    assert (e.train_with, e.peak.command, e.peak.observation) == ("5", "action[0]", "observation.state[0]")
+    assert (e.in_step, e.peak.command, e.peak.observation) == ("5", "action[0]", "observation.state[0]")
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(DelayRLError, match="damaged"):
         from_log(path)
@@ -508,13 +511,15 @@ def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     path, saved = log(tmp_path / "log.csv", *signals("servo", 4)), tmp_path / "steps.txt"
     main(["measure", str(path), "--period", "20ms", "--plot", str(tmp_path / "a.png"), "--save", str(saved)])
     out = capsys.readouterr().out
-    for words in ("dead time                 80 ms", "train with: --delay 4", f"--delay recorded:{saved}"):
+    recommended = ("train with: --delay episode:4:6", "or: --delay 4 ", f"or: --delay recorded:{saved}")
+    for words in ("dead time                 80 ms", *recommended):
         assert words in out
     assert (tmp_path / "a.png").stat().st_size > 10_000
     assert set(saved.read_text().split()) == {"4"}
     main(["measure", str(path), "--period", "40ms", "--json"])
     result = json.loads(capsys.readouterr().out)
-    assert (result["kind"], result["train_with"], result["step"]) == ("log", "2", 2)
+    assert (result["kind"], result["in_step"], result["step"]) == ("log", "2", 2)
+    assert result["train_with"] == "episode:2:3"
     assert result["low"] <= result["delay"] <= result["high"]
 
 
@@ -616,5 +621,5 @@ def test_example_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         subprocess.run(script, check=True)
     e = from_log(tmp_path / "arm.csv", 0.02)
     assert e.low <= 0.065 <= e.high
-    assert e.train_with == "4"
+    assert (e.train_with, e.in_step) == ("episode:3:5", "4")
     assert from_log(tmp_path / "stamps.csv", 0.02).low > 0.05

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import delayrl
-from delayrl.delays import Delay, as_delay
+from delayrl.delays import Delay, PerEpisode, as_delay
 from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
 from strategies import DELAYS
 
@@ -43,6 +43,9 @@ def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[
     """Keep every message with its time of arrival, and work out what counts at each step."""
     random = np.random.default_rng([seed, 1])
     states = {"action": 0, "observation": 0, "reward": 0}  # of the laws
+    lag = delay.action.maximum
+    if isinstance(delay.action.law, PerEpisode) and delay.action.rule != "wait":
+        lag, states["action"] = delay.action.law.draw(0, random)
     sent: dict[str, list[tuple[int, int]]] = {"action": [], "observation": [], "reward": []}  # (made, arrives)
 
     def send(name: str, made: int) -> int:
@@ -103,7 +106,8 @@ def account(delay: Delay, fill: str, length: int, truncates: bool, issued: list[
             break
     for t, row in enumerate(rows):
         row["obs"] = truth[row["shown"]] if row["shown"] >= 0 else np.zeros(2)
-        row["age"] = t - max(row["shown"], 0) + delay.action.maximum
+        row["age"] = t - max(row["shown"], 0) + lag
+        row["observation_age"] = t - max(row["shown"], 0)
         first = t - row["age"]
         row["actions"] = [issued[i] if i >= 0 else 0.0 for i in range(first, t)]
         row["applied"] = applied[row["shown"]] if row["shown"] >= 0 else 0
@@ -137,7 +141,7 @@ def test_equals_the_account(delay: Delay, fill: str, length: int, truncates: boo
             assert not info["actions"][row["age"] :].any()
             assert info["mask"].tolist() == [i < row["age"] for i in range(delay.maximum)]
             if delay.action.maximum:
-                assert info["observation_age"] == row["age"] - delay.action.maximum
+                assert info["observation_age"] == row["observation_age"]
                 assert info["applied"] == row["applied"]
             assert rewards[t] == row["reward"]
             assert ends[t] == row["end"]
@@ -214,7 +218,10 @@ def vector(mode: str | None, task: str, count: int = 3, **options: Any) -> Any:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-@pytest.mark.parametrize("delay", ["3", "uniform:1:4", "uniform:0:3@fifo+action=uniform:0:2", "paper-stochastic-5"])
+@pytest.mark.parametrize(
+    "delay",
+    ["3", "uniform:1:4", "uniform:0:3@fifo+action=uniform:0:2", "paper-stochastic-5", "episode:0:3+action=episode:0:2"],
+)
 def test_vector_is_many_singles(mode: str, delay: str) -> None:
     """Number for number, through the ends of episodes, in each of Gymnasium's autoreset modes."""
     from gymnasium.vector import AutoresetMode
@@ -229,7 +236,7 @@ def test_vector_is_many_singles(mode: str, delay: str) -> None:
     for _ in range(120):
         for i, (x, info) in enumerate(now):
             np.testing.assert_array_equal(obs[i], x)
-            for name in ("age", "actions", "mask", "truth"):
+            for name in ("age", "actions", "mask", "truth", *(["observation_age", "applied"] if "=" in delay else [])):
                 np.testing.assert_array_equal(infos[name][i], info[name])
         assert env.observation_space.contains(obs.astype(env.observation_space.dtype))
         if mode == "Disabled" and ended.any():
@@ -381,6 +388,50 @@ def test_travel_times_of_another_seed() -> None:
     other.reset(seed=7)
     ages = [[env.step(np.float32([0]))[4]["age"] for _ in range(30)] for env in (one, other)]
     assert ages[0] == ages[1]
+    late = Delayed(Journal(40), "action=episode:0:90", history=90)
+    late.reset(seed=1)
+    assert late.draw_from(7)[1]["age"] == late.reset(seed=7)[1]["age"] != late.reset(seed=1)[1]["age"]
+
+
+@pytest.mark.parametrize("rule", ["newest", "fifo", "raw"])
+def test_a_delay_of_each_episode(rule: str) -> None:
+    """One age for all of an episode once it has been reached, each as often as the law says, in every channel."""
+    env = Delayed(Journal(12), f"episode:choice:1=0.25,3=0.75@{rule}+action=episode:0:2+reward=episode:0:1")
+    env.reset(seed=0)
+    delays = []
+    for _ in range(400):
+        _, info = env.reset()
+        infos, rewards, done = [info], [], False
+        while not done:
+            _, reward, done, _, info = env.step(np.float32([0.5]))
+            infos.append(info)
+            rewards.append(reward)
+        observed, lag, late = infos[-1]["observation_age"], infos[-1]["age"] - infos[-1]["observation_age"], rewards[0]
+        delays.append((observed, lag, int(late == 0)))
+        assert [i["observation_age"] for i in infos] == [min(t, observed) for t in range(len(infos))]
+        assert {i["age"] - i["observation_age"] for i in infos} == {lag}
+        assert env.unwrapped.acted == [0.0] * lag + [0.5] * (12 - lag)  # type: ignore[attr-defined]
+        assert rewards == [0.0] * delays[-1][2] + [2.0**t for t in range(12)]
+    observed, lags, late = np.array(delays).T
+    assert np.mean(observed == 3) == pytest.approx(0.75, abs=0.08)
+    assert np.bincount(lags) / 400 == pytest.approx([1 / 3] * 3, abs=0.08)
+    assert np.mean(late) == pytest.approx(0.5, abs=0.08)
+    assert len(set(delays)) == 12  # independent of each other
+
+
+def test_a_late_actuator_is_a_late_sensor() -> None:
+    """What training sees of a delay of the actions that differs between episodes, in the actions' own time."""
+    text = "uniform:0:2+action=episode:1:3"
+    seen = Delayed(Journal(30), as_delay(text).observed())
+    real, lags = Delayed(Journal(30), text), set()
+    for seed in range(20):
+        seen.reset(seed=seed)
+        _, info = real.reset(seed=seed)
+        lag = info["age"]
+        ages = [[env.step(np.float32([0]))[4]["age"] for _ in range(29)] for env in (seen, real)]
+        assert ages[0][lag:] == ages[1][:-lag]
+        lags.add(lag)
+    assert lags == {1, 2, 3}
 
 
 class Gas(Journal):

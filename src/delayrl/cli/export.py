@@ -17,7 +17,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Write the bundle, and print what it holds."""
     from delayrl.deploy.export import export_run
+    from delayrl.deploy.runtime.telemetry import served
 
     metadata = export_run(given.run, given.out, force=given.force, env=given.env, agent=given.agent)
-    print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages 0..{metadata['ages'][1]}")
+    longest = metadata["ages"][1]
+    print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages 0..{longest}")
+    print(f"  serves                   {served(longest, metadata['action_delay'], metadata['dt'])}")
     print(f"  next                     delayrl latency {given.out}")

@@ -125,7 +125,11 @@ def _counts(title: str, counts: Counts | None) -> list[str]:
 def _show_log(e: Estimated, saved: Path | None) -> str:
     lines = [f"{e.path}: {e.rows:,} rows, one each {_ms(e.row)}, without the first {e.warm_up:.3g} s", ""]
     lines += _show_stamps(e) if e.method == "stamps" else _show_correlation(e)
-    lines += ["", f"train with: --delay {e.train_with}"]
+    if e.in_step == e.train_with:
+        lines += ["", f"train with: --delay {e.train_with}"]
+    else:
+        lines += ["", f"train with: --delay {e.train_with:<12} if the sensor runs on a clock of its own"]
+        lines.append(f"        or: --delay {e.in_step:<12} if it is in step with the control loop")
     if saved:
         lines.append(f"        or: --delay recorded:{saved}")
     return "\n".join(lines)

@@ -9,6 +9,8 @@ poisson:3:8             Poisson of mean 3, cut at 8
 gamma:3:1.5:8           gamma of mean 3 and standard deviation 1.5, rounded up to whole steps, cut at 8
 gilbert:1:6:0.05:0.3    a network in a good (1 step) or bad state (6); worsens with 0.05, recovers with 0.3
 markov:0,5:0.9,0.1/0.5,0.5  a chain of two states with delays 0 and 5, and its transitions row by row
+episode:2:4             2 to 4 steps, the same in all of an episode; episode:LAW draws it from any of these laws
+80ms~, 80ms~15ms        80 ms (to 95 ms), from a sensor at any phase of the control loop: 2 or 3 steps of 40 ms
 walk:8, walk:8:0.5      a random walk on 0..8 that moves with probability 2/3 (or 0.5)
 recorded:trace.csv      measured delays, from a random one on; recorded:trace.csv:ms if they are times
 uniform:1:5@fifo        a rule: newest (the default), fifo, raw or wait
@@ -25,6 +27,7 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 from delayrl.delays import laws
+from delayrl.delays.episodes import PerEpisode, Sum, unsynchronised
 from delayrl.delays.laws import Constant, DelayLaw, whole_steps
 from delayrl.delays.recordings import in_steps, is_number, recorded, rounded_up
 from delayrl.errors import DelayRLError
@@ -63,6 +66,11 @@ class Channel:
         """Whether every message counts equally late: it travels as long as every other, or waits for the longest."""
         return isinstance(self.law, Constant) or self.rule == "wait"
 
+    @property
+    def steady(self) -> bool:
+        """Whether every message of one episode counts equally late."""
+        return self.constant or isinstance(self.law, PerEpisode)
+
     def __str__(self) -> str:
         for name, preset in PRESETS.items():
             if self == preset:
@@ -77,8 +85,8 @@ PRESETS = {"paper-stochastic-5": PAPER_STOCHASTIC_5}
 CHANNELS = ("observation", "action", "reward")
 FORMS = (
     "a delay is 5, 80ms, uniform:1:5, choice:1=0.1,5=0.9, poisson:MEAN:MAX, gamma:MEAN:DEVIATION:MAX, "
-    "gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, markov:0,5:0.9,0.1/0.5,0.5, recorded:FILE, paper-stochastic-5; "
-    "then @newest, @fifo or @raw"
+    "gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, markov:0,5:0.9,0.1/0.5,0.5, recorded:FILE, episode:2:4, 80ms~, "
+    "paper-stochastic-5; then @newest, @fifo or @raw"
 )
 
 
@@ -112,19 +120,30 @@ class Delay:
         """Move the delay of the actions to the observations, as training does.
 
         An action that acts D steps later acts on a state that is D steps newer than the one seen with it. In the
-        actions' own time the observations are thus late by D more. The replay keeps rewards with their steps.
+        actions' own time the observations are thus late by D more. D may differ between episodes. The replay keeps
+        rewards with their steps.
 
         Raises:
-            DelayRLError: the actions have a random delay.
+            DelayRLError: the actions have a delay that is random within an episode.
         """
+        lag = self.action.law
+        if isinstance(lag, PerEpisode) and not self.action.constant:
+            return Delay(self._later_by_episode(lag))
         if not self.action.constant:
             raise DelayRLError(
-                f"training takes actions with a constant delay; got {self.action}. Hold early ones back until "
-                f"{self.action.maximum} steps have passed (action={self.action.law}@wait), or train on delayrl.wrappers"
+                f"training takes actions with a constant delay, at least within an episode; got {self.action}. "
+                f"Hold early ones back until {self.action.maximum} steps have passed "
+                f"(action={self.action.law}@wait), or train on delayrl.wrappers"
             )
         if not self.action.maximum:
             return Delay(self.observation)
         return Delay(replace(self.observation, law=self.observation.law.shifted(self.action.maximum)))
+
+    def _later_by_episode(self, lag: PerEpisode) -> Channel:
+        """Return the channel of the observations, later by the delay of each episode."""
+        if self.observation.constant:
+            return Channel(lag.shifted(self.observation.maximum))
+        return replace(self.observation, law=Sum(self.observation.law, lag))
 
     def acted(self) -> "Delay":
         """Remove the delay of the rewards, as evaluation and deployment do."""
@@ -206,7 +225,7 @@ def short_label(text: int | str) -> int | str:
     return re.sub(r"[\d,./=e-]{40,}", lambda match: hashlib.sha256(match[0].encode()).hexdigest()[:12], text)
 
 
-LAWS = ("uniform", "choice", "poisson", "gamma", "gilbert", "walk", "markov", "recorded")
+LAWS = ("uniform", "choice", "poisson", "gamma", "gilbert", "walk", "markov", "recorded", "episode")
 
 
 class DelayParser:
@@ -236,7 +255,7 @@ class DelayParser:
     def channel(self, part: str) -> Channel:
         """Return the channel that a part of the text describes."""
         head, separator, rule = part.rpartition("@")
-        in_path = part.startswith("recorded:") and rule not in get_args(Rule)
+        in_path = re.match("(episode:)*recorded:", part) and rule not in get_args(Rule)
         if not separator or in_path:
             return PRESETS.get(part) or Channel(self.law(part))
         law = PRESETS[head].law if head in PRESETS else self.law(head)
@@ -247,6 +266,9 @@ class DelayParser:
         name, separator, rest = part.partition(":")
         if not separator and name in LAWS:
             raise DelayRLError(f"the law {name!r} takes values after a colon ({FORMS})")
+        if not separator and "~" in part:
+            delay, _, jitter = part.partition("~")
+            return unsynchronised(self.real(delay), self.real(jitter or "0"))
         if not separator:
             return Constant(self.steps(part))
         match name:
@@ -271,6 +293,8 @@ class DelayParser:
                 states, table = self.values(rest, str, str)
                 rows = tuple(tuple(map(self.probability, row.split(","))) for row in table.split("/"))
                 return laws.Markov(tuple(map(self.steps, states.split(","))), rows)
+            case "episode":  # with two numbers, of a uniform law
+                return PerEpisode(self.law(f"uniform:{rest}" if re.match(r"[^:a-z]+(s|ms)?:", rest) else rest))
             case "recorded" if re.fullmatch(r"(\d{1,9},)+(\d{1,9})?", rest):
                 return laws.Recorded(tuple(int(word) for word in rest.split(",") if word))
             case "recorded":

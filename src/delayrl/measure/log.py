@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from delayrl.delays import PerEpisode, any_phase, uniform
 from delayrl.errors import DelayRLError
 from delayrl.measure import correlate, reading
 from delayrl.measure.correlate import Array
@@ -51,6 +52,7 @@ class Estimated:
     warm_up: float  # seconds left out at the start
     steps: tuple[int, ...]  # the delay of each window or observation, in steps, in order of time
     step: int  # `delay` in steps
+    span: tuple[float, float]  # the shortest and the longest delay to train for, in seconds; see `train_with`
     strength: float | None = None  # of the strongest lag; chance reaches 1 in one of a thousand logs
     peak: Pair | None = None  # largest correlation of increments; its lag includes the plant's own lag
     pairs: tuple[Pair, ...] = ()  # the strongest pairs
@@ -62,7 +64,24 @@ class Estimated:
 
     @property
     def train_with(self) -> str:
-        """The argument for `delayrl train --delay`: the steps, or `uniform:LOW:HIGH` if they vary.
+        """The argument for `delayrl train --delay`, for a sensor at any phase of the control loop.
+
+        With stamps it covers the smallest delay to the 99th percentile, for a sensor with the period that the stamps
+        have. By correlation it covers the dead time, which is known to a row, or the 10th to the 90th percentile of
+        windows that differ, for a sensor with the period of the loop. The law is of each episode, or of each message
+        if the delays vary.
+        """
+        stamped, (low, high) = self.method == "stamps", np.array(self.span) / self.period
+        youngest, oldest = any_phase(low, high, self.row / self.period if stamped else 1.0)
+        if youngest == oldest:
+            return str(oldest)
+        law = uniform(youngest, oldest)
+        varies = high - low > TOLERANCE if stamped else len(self.counts) > 1
+        return str(law if varies else PerEpisode(law))
+
+    @property
+    def in_step(self) -> str:
+        """The argument for a sensor in step with the control loop: the steps, or `uniform:LOW:HIGH` if they vary.
 
         With stamps, LOW is the smallest delay and HIGH the 99th percentile. With windows, they are the 10th and 90th,
         because a window is short and its estimate is rough.
@@ -84,7 +103,7 @@ class Estimated:
 
     def json(self) -> dict[str, Any]:
         """Return a dict for `json.dumps`."""
-        fields = {"kind": "log", **asdict(self), "train_with": self.train_with}
+        fields = {"kind": "log", **asdict(self), "train_with": self.train_with, "in_step": self.in_step}
         return fields | {"steps": {str(step): count for step, count in self.counts.items()}}
 
 
@@ -175,6 +194,7 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
         warm_up=warm,
         steps=tuple(rounded_up_steps(d, period) for d in kept),
         step=rounded_up_steps(float(np.median(kept)), period),
+        span=(float(kept.min()), float(np.quantile(kept, 0.99))),
         longest=float(kept.max()),
         slowest_warm_up=float(delays[~used].max()) if (~used).any() else None,
         drift=float(np.polyfit(times, least, 1)[0]) * 1e6,
@@ -222,6 +242,7 @@ def _correlated(
     pairs, r = _pairs(log, commands, observations, episode, lags, row)
     strength = correlate.strength(correlation)[0]
     delay = (first - 1) * row
+    shortest, most = np.quantile([d for _, d in windows], (0.1, 0.9)) if len(windows) > 2 else (delay, delay)
     return Estimated(
         method="correlation",
         path=str(path),
@@ -234,6 +255,7 @@ def _correlated(
         warm_up=warm,
         steps=tuple(rounded_up_steps(d, period) for _, d in windows),
         step=rounded_up_steps(delay, period),
+        span=(float(shortest), float(most) + row),
         strength=float(strength.max()),
         peak=pairs[0],
         pairs=pairs[:10],

@@ -72,9 +72,11 @@ class Evaluator:
             [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
-        for envs, seeds in zip(self._envs, travel_seeds or (), strict=False):
-            for env, seed in zip(envs, seeds, strict=True):
-                env.draw_from(seed)
+        if travel_seeds is not None:
+            seen = [
+                [self._see(*env.draw_from(seed)) for env, seed in zip(envs, seeds, strict=True)]
+                for envs, seeds in zip(self._envs, travel_seeds, strict=True)
+            ]
         step = 0
         while running.any():
             batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))

@@ -31,8 +31,8 @@ class Actor:
         self.episode, self.actions, self.total = episode, list[NDArray[np.float32]](), 0.0
         own_seed = reset_seed(self.seed, TRAINING, episode)
         if self.protocol.start_states == "same":
-            shown = self.env.reset(seed=self.seed)
-            self.env.draw_from(own_seed)  # one start state, but not one sequence of travel times
+            self.env.reset(seed=self.seed)
+            shown = self.env.draw_from(own_seed)  # one start state, but not one sequence of travel times
         else:
             shown = self.env.reset(seed=own_seed)
         self._see(*shown)

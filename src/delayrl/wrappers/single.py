@@ -104,7 +104,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
 
     Added to `info`, with H the history's length (the longest age), A the size of an action and S of an observation:
       age      (int)           how many actions may not have acted yet on the state that is shown: the steps since it
-                               was made, plus the longest delay of the actions
+                               was made, plus the longest delay of the actions in this episode
       actions  (float [H, A])  these actions as they were issued, oldest first, zeros after the first `age`
       mask     (bool [H])      true for the first `age` slots
       truth    (float [S])     the true current observation: for privileged learners and tests, never for the agent
@@ -172,14 +172,15 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         obs, info = self._show()
         return obs, reward, terminated, truncated, info
 
-    def draw_from(self, seed: int) -> None:
+    def draw_from(self, seed: int) -> tuple[NDArray[Any], Info]:
         """Take the delays of the current episode, and the random actions of `NoisyActions`, from another seed.
 
-        Call it right after `reset`.
+        Call it right after `reset`. Returns what `reset` would then have returned.
         """
-        self._transit.random = np.random.default_rng([seed, 1])
+        self._transit.draw_from(seed)
         if self.env.has_wrapper_attr("draw_from"):
             self.env.get_wrapper_attr("draw_from")(seed)
+        return self._show()
 
     def _show(self) -> tuple[NDArray[Any], Info]:
         obs, age, recent, applied = self._transit.shown()
@@ -190,5 +191,5 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
             actions[:age] = recent
         info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy(), "truth": self._truth}
         if self.delay.action.maximum:
-            info["observation_age"], info["applied"] = age - self.delay.action.maximum, applied
+            info["observation_age"], info["applied"] = age - self._transit.lag, applied
         return obs.copy(), info

@@ -22,6 +22,7 @@ class MessageQueue:
     def __init__(self, channel: Channel):
         self._law, self._constant, self._maximum = channel.law, channel.constant, channel.maximum
         self._raw, self._fifo, self._slots = channel.rule == "raw", channel.rule == "fifo", channel.maximum + 1
+        self._settles = channel.steady and not channel.constant
         self.start()
 
     def start(self, newest: int = -1) -> None:
@@ -29,6 +30,13 @@ class MessageQueue:
         # by arrival time, modulo; older entries have lower numbers than what has arrived, so they need not be cleared
         self._due = [-1] * self._slots
         self._newest, self._law_state, self._latest = newest, 0, 0
+
+    def settle(self, random: np.random.Generator) -> int:
+        """Return the longest delay of this episode, and draw it if the law keeps one for an episode."""
+        if not self._settles:
+            return self._maximum
+        travel, self._law_state = self._law.draw(0, random)
+        return travel
 
     def send(self, number: int, random: np.random.Generator) -> int:
         """Send message `number` at time `number`. Returns the message that counts now."""
@@ -88,6 +96,7 @@ class Transit:
     Attributes:
         time: steps since the start of the episode.
         over: whether the episode has ended, but the agent has not been told yet. Actions then have no effect.
+        lag: the longest delay of the actions in this episode, in steps. It is part of the age.
         random: the generator of travel times.
 
     Args:
@@ -112,17 +121,16 @@ class Transit:
         self._applied = [0] * self._slots
         self._shown = 0
         self._end: int | None = None  # once the episode is over: when the agent is told
-        self.time, self.over = 0, False
+        self.time, self.over, self.lag = 0, False, self._max_action_delay
         self.random = np.random.default_rng()
 
     def reset(self, truth: NDArray[Any], seed: int | None = None) -> None:
         """Start an episode with the true s_0, [S]. A seed fixes the delays apart from the environment's randomness."""
-        if seed is not None:
-            self.random = np.random.default_rng([seed, 1])
         self.time, self._end, self.over = 0, None, False
         self._ring[:] = self._idle
         self._rewards.start()
         self._actions.start()
+        self.draw_from(seed)
         self._truths[0], self._applied[0] = np.array(truth), 0
         if self._fill == "first":
             self._observations.start(0)
@@ -130,6 +138,12 @@ class Transit:
         else:
             self._observations.start()
             self._shown = self._observations.send(0, self.random)
+
+    def draw_from(self, seed: int | None) -> None:
+        """Draw the delays of an episode that has just begun from this seed; None goes on with the generator."""
+        if seed is not None:
+            self.random = np.random.default_rng([seed, 1])
+        self.lag = self._actions.settle(self.random)
 
     def act(self, action: NDArray[Any]) -> NDArray[Any]:
         """Issue an action. Returns the one that acts now: the same array if it has no delay."""
@@ -171,13 +185,13 @@ class Transit:
 
         Returns:
             obs: the observation, [S].
-            age: how many actions may not have acted on it: its own age plus the longest delay of the actions.
+            age: how many actions may not have acted on it: its own age plus `lag`.
             actions: these actions as they were issued, oldest first, [age, A].
             applied: the age of the action that led to the observation.
         """
         nothing_arrived = self._shown < 0
         made = 0 if nothing_arrived else self._shown
-        age = self.time - made + self._max_action_delay
+        age = self.time - made + self.lag
         first, slot = (self.time - age) % self._rows, made % self._slots
         actions = self._ring[first : first + age]
         if nothing_arrived:

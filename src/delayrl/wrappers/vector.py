@@ -123,6 +123,6 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         age = np.array(ages)
         own = {"age": age, "actions": actions, "mask": self._masks[age], "truth": np.array(truth)}
         if self.delay.action.maximum:
-            own["observation_age"] = age - self.delay.action.maximum
+            own["observation_age"] = age - np.array([transit.lag for transit in transits])
             own["applied"] = np.array(applied)
         return np.array(observations), own

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.runtime.episode import Action, Arrival, Clock, Episode, History, Stamps
-from delayrl.deploy.runtime.telemetry import Statistics, Telemetry
+from delayrl.deploy.runtime.telemetry import Statistics, Telemetry, served
 from delayrl.errors import DelayRLError
 
 OnOverrun = Literal["hold", "clip", "raise"]
@@ -116,6 +116,11 @@ class Controller:
         self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
         self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
         policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
+
+    @property
+    def serves(self) -> str:
+        """The delays of observations that the policy serves at this action delay, in words."""
+        return served(self.policy.max_age, self.action_delay, self._clock.period if self.stamps == "seconds" else None)
 
     @property
     def ready(self) -> bool:

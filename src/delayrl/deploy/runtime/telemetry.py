@@ -78,3 +78,23 @@ class Telemetry:
         """Return all numbers so far."""
         moments = self._ages.named("age") | self._delays.named("delay") | self._periods.named("period")
         return Statistics(**self.counts, **moments, counted=self._ages.count, age_max=self._age_max)
+
+
+def served(max_age: int, action_delay: int, dt: float | None) -> str:
+    """Say which delays of the observations a policy serves.
+
+    Ages are rounded to steps, so a sensor at any phase of the control loop takes half a step of them
+    (`delayrl.delays.any_phase`).
+
+    Args:
+        max_age: the longest age, in steps.
+        action_delay: the part of it that commands take to act.
+        dt: seconds a step; None if unknown.
+    """
+    steps = max_age - action_delay
+
+    def late(steps: float) -> str:
+        return f"up to {steps:g} steps late" if dt is None else f"up to {1000 * steps * dt:.4g} ms late"
+
+    phases = f"{late(steps - 0.5)} at any phase" if steps else "none at another phase"
+    return f"observations {late(steps)} from a sensor in step with the control loop, {phases}"
