@@ -30,6 +30,9 @@ def trained(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, protocol: Proto
             calls.append(("evaluate", step))
             return ""
 
+        def episodes(self, ended: list[list[dict[str, Any]]]) -> None:
+            assert len(ended) == len(SEEDS)
+
     class Fake:
         def act(self, agent: Any, seen: Any, keys: Any, step: int) -> Any:
             calls.append(("act", step))
