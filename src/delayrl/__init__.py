@@ -55,5 +55,10 @@ watch_gymnasium()
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        return getattr(import_module(f"delayrl.{_HOME[name]}"), name)
+        try:
+            return getattr(import_module(f"delayrl.{_HOME[name]}"), name)
+        except ModuleNotFoundError as error:
+            from delayrl.errors import needs_extra
+
+            raise (needs_extra(error) or error) from error
     raise AttributeError(f"module 'delayrl' has no attribute {name!r}")

@@ -17,6 +17,16 @@ class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
 
 
+TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL")
+"""Modules that the extra `train` brings."""
+
+
+def needs_extra(error: ModuleNotFoundError) -> DelayRLError | None:
+    """Return the error that says which extra brings a missing module; None if it is not one of ours."""
+    module = (error.name or "").partition(".")[0]
+    return DelayRLError(f"this needs {module}: pip install 'delayrl[train]'") if module in TRAIN else None
+
+
 def near_names(name: str, known: Iterable[str]) -> list[str]:
     """Return up to three known names that may be meant: by the initials of their words (`lr`), or by their spelling."""
     known, letters = list(known), name.strip("-").lower()

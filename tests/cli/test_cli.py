@@ -254,3 +254,19 @@ def test_stopped_run_goes_on(tmp_path: Path) -> None:
     stopped = Run(tmp_path / "run").latest().step
     assert stopped > 0
     assert f"stopped at step {stopped:,}" in err
+
+
+@pytest.mark.parametrize(("module", "status"), [("optax.transforms", 2), ("PIL", 2), ("somebodys_module", None)])
+def test_a_missing_extra_is_one_line(module: str, status: int | None, monkeypatch, capsys) -> None:
+    """Modules that an extra brings; a bug in an import of another is shown as it is."""
+
+    def missing(given: object) -> None:
+        raise ModuleNotFoundError("gone", name=module)
+
+    monkeypatch.setattr("delayrl.cli.runs.run", missing)
+    with pytest.raises(SystemExit if status else ModuleNotFoundError) as stopped:
+        main(["runs", "."])
+    if status:
+        assert stopped.value.code == status
+        name = module.partition(".")[0]
+        assert capsys.readouterr().err == f"delayrl: this needs {name}: pip install 'delayrl[train]'\n"

@@ -9,7 +9,7 @@ from typing import Any
 
 from delayrl import __version__
 from delayrl.cli.console import Parser
-from delayrl.errors import DelayRLError, DelayWarning
+from delayrl.errors import DelayRLError, DelayWarning, needs_extra
 
 COMMANDS = {
     "train": "train an agent, or resume a run",
@@ -36,6 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _run(list(sys.argv[1:] if arguments is None else arguments))
     except DelayRLError as error:
         print(f"delayrl: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        if (needed := needs_extra(error)) is None:
+            raise
+        print(f"delayrl: {needed}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # before OSError, its base class
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

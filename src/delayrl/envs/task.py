@@ -219,12 +219,11 @@ def _check_fresh(part: Part, base: Env) -> None:
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """Suppress notes on deprecated models and versions, which MuJoCo would also log to a file in the current folder."""
-    import mujoco
+    with warnings.catch_warnings(), contextlib.ExitStack() as stack:
+        warnings.simplefilter("ignore")
+        with contextlib.suppress(ModuleNotFoundError):
+            import mujoco
 
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(None)
+            mujoco.set_mju_user_warning(lambda message: None)
+            stack.callback(mujoco.set_mju_user_warning, None)
+        yield
