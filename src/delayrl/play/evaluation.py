@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from delayrl.agents.base import Agent, State
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
-from delayrl.delays import Delay
+from delayrl.delays import Delay, DelayLike
 from delayrl.envs import delay_of, make
 from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayRLError
-from delayrl.play.policy import Policy, load, task_of
+from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run
 
@@ -99,7 +99,7 @@ class Evaluator:
         return seen_now(obs, info, self._delay, privileged=False)
 
 
-def servable(env: TaskLike, delay: int | str | Delay, spec: Spec) -> Delay:
+def servable(env: TaskLike, delay: DelayLike, spec: Spec) -> Delay:
     """Return the delay without that of rewards. Raises DelayRLError if it is longer than a policy was trained for."""
     served = delay_of(env, delay).acted()
     if served.maximum > spec.delay:
@@ -141,7 +141,7 @@ TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
 def evaluate(
     run: str | Path,
     episodes: int = 10,
-    delay: int | str | None = None,
+    delay: DelayLike | None = None,
     seed: int = 0,
     *,
     env: TaskLike | None = None,
@@ -153,7 +153,7 @@ def evaluate(
     Args:
         run: the run folder.
         episodes: how many.
-        delay: any delay that it can serve, a number or a text; None for the one it was trained for.
+        delay: any delay that it can serve, as `train`; None for the one it was trained for.
         seed: of the start states.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of it, as `load`.
@@ -167,7 +167,7 @@ def evaluate(
     """
     config, task = Run(Path(run)).config, task_of(run, env, env_kwargs)
     policy = load(run, task, agent=agent)
-    return _play(policy, config, task, config["delay"] if delay is None else delay, episodes, seed)
+    return _play(policy, config, task, trained_delay(run) if delay is None else delay, episodes, seed)
 
 
 def sweep(
@@ -187,7 +187,7 @@ def sweep(
 
 
 def _play(
-    policy: Policy, config: dict[str, Any], task: Task, delay: int | str, episodes: int, seed: int
+    policy: Policy, config: dict[str, Any], task: Task, delay: DelayLike, episodes: int, seed: int
 ) -> dict[str, Any]:
     if episodes < 1:
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
