@@ -1,4 +1,4 @@
-"""Runs of a few hundred steps with tiny networks."""
+"""Runs of a few hundred steps with tiny networks; and what an installed package says of itself."""
 
 from pathlib import Path
 
@@ -60,3 +60,12 @@ def killed_and_resumed(agent: str, out: Path, monkeypatch: pytest.MonkeyPatch, *
 
 def arrays(run: Run) -> dict[str, np.ndarray]:
     return run.latest().arrays("agent")
+
+
+def declare(folder: Path, group: str, **points: str) -> None:
+    """Write into a folder what an installed package says of its entry points."""
+    home = folder / f"{group.replace('.', '_')}-1.0.dist-info"
+    home.mkdir()
+    (home / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {group.replace('.', '_')}\nVersion: 1.0\n")
+    lines = [f"{name} = {source}" for name, source in points.items()]
+    (home / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))

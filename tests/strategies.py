@@ -16,7 +16,10 @@ from delayrl.delays import (
     random_walk,
     uniform,
 )
+from delayrl.delays.own import own_law
+from own_laws import Burst
 
+str(own_law(Burst()))  # the first one reads what is installed, which takes longer than an example may
 STEPS = st.integers(0, 6)
 CHANCE = st.floats(0.01, 0.99)
 
@@ -42,6 +45,7 @@ LAWS = st.one_of(
     st.builds(random_walk, STEPS, CHANCE),
     st.lists(STEPS, min_size=1, max_size=60).map(lambda steps: Recorded(tuple(steps))),
     EPISODES,
+    st.builds(Burst, CHANCE, STEPS, st.integers(1, 3)).map(own_law),
 )
 CHANNELS = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "raw", "wait"]))
 ORDERED = st.builds(Channel, LAWS, st.sampled_from(["newest", "fifo", "wait"]))

@@ -6,6 +6,7 @@ A name is `module:object`, or that of an entry point: an installed package decla
 
 import contextlib
 import difflib
+import functools
 import importlib
 import importlib.util
 import json
@@ -13,7 +14,6 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -63,6 +63,13 @@ def name_of_object(thing: Any) -> str:
 
 def entry_points(group: str) -> dict[str, str]:
     """Return what installed packages declare in a group: the `module:object` of each name."""
+    return _declared(group, tuple(sys.path))
+
+
+@functools.cache  # it reads a file of every installed package
+def _declared(group: str, path: tuple[str, ...]) -> dict[str, str]:
+    from importlib import metadata  # takes longer than all of this module, and few names need it
+
     return {point.name: point.value.replace(" ", "") for point in metadata.entry_points(group=group)}
 
 

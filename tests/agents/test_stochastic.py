@@ -165,21 +165,6 @@ def test_official_episodes_have_their_own_travel_times() -> None:
     assert len(whole) > len(ages) // 2
 
 
-def test_custom_laws_are_refused_in_training(tmp_path: Path) -> None:
-    class Mine:
-        maximum = 2
-
-        def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
-            return 2, state
-
-        def shifted(self, steps: int) -> "Mine":
-            return self
-
-    with pytest.raises(delayrl.DelayRLError, match=r"delayrl\.delays|is not a number"):
-        train("a-sac", tmp_path / "run", delay=Delay(Channel(Mine())))  # type: ignore[arg-type]
-    assert not (tmp_path / "run").exists()
-
-
 def test_random_action_delays_are_refused_in_training(tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match="constant delay") as error:
         train("a-sac", tmp_path / "run", delay="1+action=uniform:0:2")

@@ -25,7 +25,7 @@ from delayrl.run.condition import overrides_of, resolve
 from delayrl.run.folder import Run
 from own_agents import Shrink
 from own_tasks import make_arm, write_module
-from short_runs import arrays
+from short_runs import arrays, declare
 
 SHORT: dict[str, Any] = {"steps": 250, "random_steps": 100, "replay_capacity": 100, "evaluate_every": 250}
 SHORT |= {"evaluation_episodes": 2, "preset": "small", "progress": False}
@@ -39,15 +39,6 @@ def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def train(agent: Any, out: Path, **values: Any) -> Run:
     return delayrl.train(agent, make_arm, 3, out=out, **{**SHORT, **values})
-
-
-def declare(folder: Path, group: str, **points: str) -> None:
-    """Write into a folder what an installed package says of its entry points."""
-    home = folder / f"{group.replace('.', '_')}-1.0.dist-info"
-    home.mkdir()
-    (home / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {group.replace('.', '_')}\nVersion: 1.0\n")
-    lines = [f"{name} = {source}" for name, source in points.items()]
-    (home / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))
 
 
 # ------------------------------------------------------------------------------------------------ with a name
@@ -208,7 +199,11 @@ def test_code_that_came_with_a_run_is_not_imported(tmp_path: Path, monkeypatch) 
     monkeypatch.chdir(tmp_path)
     run = train(Shrink, Path("runs/mine"))
     witness = tmp_path / "witness"
-    write_module(tmp_path / "runs", "evil", f"open({str(witness)!r}, 'w')\nfrom own_agents import Shrink")
+    write_module(
+        tmp_path / "runs",
+        "evil",
+        f"from pathlib import Path\nPath({str(witness)!r}).touch()\nfrom own_agents import Shrink",
+    )
     for name in ("runs.evil:Shrink", "os:system", "pathlib:Path"):
         config = {**run.config, "agent": name}
         (run.path / "config.json").write_text(json.dumps(config))

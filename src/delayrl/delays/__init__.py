@@ -8,6 +8,7 @@ from delayrl.delays.channels import Rule as Rule
 from delayrl.delays.channels import as_delay as as_delay
 from delayrl.delays.channels import in_other_unit as in_other_unit
 from delayrl.delays.channels import short_label as short_label
+from delayrl.delays.channels import stored_delay as stored_delay
 from delayrl.delays.episodes import PerEpisode as PerEpisode
 from delayrl.delays.episodes import any_phase as any_phase
 from delayrl.delays.episodes import unsynchronised as unsynchronised

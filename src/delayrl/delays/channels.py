@@ -13,6 +13,7 @@ episode:2:4             2 to 4 steps, the same in all of an episode; episode:LAW
 80ms~, 80ms~15ms        80 ms (to 95 ms), from a sensor at any phase of the control loop: 2 or 3 steps of 40 ms
 walk:8, walk:8:0.5      a random walk on 0..8 that moves with probability 2/3 (or 0.5)
 recorded:trace.csv      measured delays, from a random one on; recorded:trace.csv:ms if they are times
+my_laws:Burst(rate=0.1) a law of your own, as module:Class; or of an installed package, by the name of an entry point
 uniform:1:5@fifo        a rule: newest (the default), fifo, raw or wait
 2+action=1+reward=3     observations 2 steps late, actions 1, rewards and terminations 3
 paper-stochastic-5      VDPO's stochastic delay: 5 with probability 0.9, else uniform on 1..5; rule raw
@@ -24,11 +25,13 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 from delayrl.delays import laws
 from delayrl.delays.episodes import PerEpisode, Sum, unsynchronised
 from delayrl.delays.laws import Constant, DelayLaw, whole_steps
+from delayrl.delays.own import OwnLaw, UserLaw, find_law, is_law, own_law
 from delayrl.delays.recordings import in_steps, is_number, recorded, rounded_up
 from delayrl.errors import DelayRLError
 
@@ -39,6 +42,7 @@ the observation may go back in time."""
 StepSeconds = float | Callable[[], float | None] | None
 """The length of an environment step, or a function that returns it; None if it is unknown."""
 NO_DELAY = Constant(0)
+OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, OwnLaw)
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,8 @@ class Channel:
     def __post_init__(self) -> None:
         if isinstance(self.law, str):
             raise DelayRLError(f"a channel takes a law, not text: write as_delay({self.law!r}) or Delay({self.law!r})")
-        if not isinstance(self.law, DelayLaw):
-            object.__setattr__(self, "law", Constant(self.law))
+        if not isinstance(self.law, OURS):
+            object.__setattr__(self, "law", own_law(self.law) if is_law(self.law) else Constant(self.law))  # type: ignore[arg-type]
         if self.rule not in get_args(Rule):
             raise DelayRLError(f"an arrival rule is one of {', '.join(get_args(Rule))}; got {self.rule!r}")
 
@@ -86,7 +90,7 @@ CHANNELS = ("observation", "action", "reward")
 FORMS = (
     "a delay is 5, 80ms, uniform:1:5, choice:1=0.1,5=0.9, poisson:MEAN:MAX, gamma:MEAN:DEVIATION:MAX, "
     "gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, markov:0,5:0.9,0.1/0.5,0.5, recorded:FILE, episode:2:4, 80ms~, "
-    "paper-stochastic-5; then @newest, @fifo or @raw"
+    "paper-stochastic-5, or MODULE:CLASS(ARGUMENT=VALUE); then @newest, @fifo or @raw"
 )
 
 
@@ -167,8 +171,8 @@ class Delay:
         return "+".join(parts)
 
 
-DelayLike = float | str | DelayLaw | Channel | Delay
-"""Steps, a text, a law or a channel of the observations, or a delay."""
+DelayLike = float | str | DelayLaw | UserLaw | Channel | Delay
+"""Steps, a text, a law (yours too) or a channel of the observations, or a delay."""
 
 
 def as_delay(delay: DelayLike, step_seconds: StepSeconds = None) -> Delay:
@@ -191,6 +195,17 @@ def as_delay(delay: DelayLike, step_seconds: StepSeconds = None) -> Delay:
     if isinstance(delay, float) and delay.is_integer():
         delay = int(delay)
     return Delay(Channel(delay))  # type: ignore[arg-type]
+
+
+def stored_delay(text: int | str, folder: Path) -> Delay:
+    """Return the delay of a run folder, as its configuration has it.
+
+    A law that the folder has no name for has its maximum, and cannot be drawn from.
+
+    Raises:
+        DelayRLError: no text of a delay; or the folder names code that it may not name (`own.find_law`).
+    """
+    return Delay(**DelayParser(str(text), folder=folder).channels())
 
 
 def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
@@ -231,8 +246,8 @@ LAWS = ("uniform", "choice", "poisson", "gamma", "gilbert", "walk", "markov", "r
 class DelayParser:
     """Parse the text of one delay. The methods raise DelayRLError if they cannot."""
 
-    def __init__(self, text: str, step_seconds: StepSeconds = None):
-        self._text, self._given_seconds = text, step_seconds
+    def __init__(self, text: str, step_seconds: StepSeconds = None, folder: Path | None = None):
+        self._text, self._given_seconds, self._folder = text, step_seconds, folder
 
     @cached_property
     def step_seconds(self) -> float | None:
@@ -256,7 +271,7 @@ class DelayParser:
         """Return the channel that a part of the text describes."""
         head, separator, rule = part.rpartition("@")
         in_path = re.match("(episode:)*recorded:", part) and rule not in get_args(Rule)
-        if not separator or in_path:
+        if not separator or in_path or ")" in rule:
             return PRESETS.get(part) or Channel(self.law(part))
         law = PRESETS[head].law if head in PRESETS else self.law(head)
         return Channel(law, rule)  # type: ignore[arg-type]  # Channel checks the rule
@@ -266,6 +281,8 @@ class DelayParser:
         name, separator, rest = part.partition(":")
         if not separator and name in LAWS:
             raise DelayRLError(f"the law {name!r} takes values after a colon ({FORMS})")
+        if name not in LAWS and re.match(r"[^\W\d]|<", part) and (own := find_law(part, self._folder)):
+            return own
         if not separator and "~" in part:
             delay, _, jitter = part.partition("~")
             return unsynchronised(self.real(delay), self.real(jitter or "0"))

@@ -14,7 +14,7 @@ from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayWarning
-from delayrl.play.policy import Policy, restored, task_of
+from delayrl.play.policy import Policy, restored, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import Run
@@ -101,7 +101,7 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
 def describe(run: Run, step: int, longest: int, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
     config = run.config
-    env = make(task, config["delay"])
+    env = make(task, trained_delay(run.path))
     env.close()
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from delayrl.agents.base import Agent, State
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
-from delayrl.delays import Delay
+from delayrl.delays import Delay, DelayLike
 from delayrl.envs import delay_of, make
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
-from delayrl.play.policy import Policy, load, task_of
+from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run, as_run
 
@@ -101,7 +101,7 @@ class Evaluator:
         return seen_now(obs, info, self._delay, privileged=False)
 
 
-def servable(env: TaskLike, delay: int | str | Delay, spec: Spec) -> Delay:
+def servable(env: TaskLike, delay: DelayLike, spec: Spec) -> Delay:
     """Return the delay without that of rewards. Raises DelayRLError if it is longer than a policy was trained for."""
     served = delay_of(env, delay).acted()
     if served.maximum > spec.delay:
@@ -143,7 +143,7 @@ TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
 def evaluate(
     run: str | Path | Run | Policy,
     episodes: int = 10,
-    delay: int | str | None = None,
+    delay: DelayLike | None = None,
     seed: int = 0,
     *,
     env: TaskLike | None = None,
@@ -155,7 +155,7 @@ def evaluate(
     Args:
         run: the run, its folder, or a policy, whose task `env` then has to say.
         episodes: how many.
-        delay: any delay that it can serve, a number or a text; None for the one it was trained for.
+        delay: any delay that it can serve, as `train`; None for the one it was trained for.
         seed: of the start states.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of it, as `load`.
@@ -167,13 +167,14 @@ def evaluate(
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
+    usual: DelayLike
     if isinstance(run, Policy):
         if env is None:
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
         task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
     else:
         config, task = as_run(run).config, task_of(run, env, env_kwargs)
-        policy, name, usual = load(run, task, agent=agent), config["agent"], config["delay"]
+        policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
     return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
 
@@ -193,7 +194,7 @@ def sweep(
         yield _play(policy, name, task, delay, episodes, seed)
 
 
-def _play(policy: Policy, name: str, task: Task, delay: int | str, episodes: int, seed: int) -> dict[str, Any]:
+def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:
     if episodes < 1:
         raise DelayRLError(f"episodes must be at least 1; got {episodes}")
     check_seed(seed)

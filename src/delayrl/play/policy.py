@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from delayrl.agents.base import Agent, State, template
 from delayrl.core.types import Spec
 from delayrl.core.views import seen_now
+from delayrl.delays import Delay, stored_delay
 from delayrl.envs import make
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
@@ -92,12 +93,18 @@ def task_of(path: str | Path | Run, env: TaskLike | None = None, env_kwargs: Map
     return stored_task(run.config["env"], run.path, env, env_kwargs)
 
 
+def trained_delay(path: str | Path | Run) -> Delay:
+    """Return the delay that a run was trained under. A law without a name has its maximum, and cannot be drawn from."""
+    run = as_run(path)
+    return stored_delay(run.config["delay"], run.path)
+
+
 def restored(
     run: Run, config: dict[str, Any], checkpoint: Checkpoint, task: Task, given: AgentLike | None = None
 ) -> Policy:
     """Load the policy in a checkpoint of a run with this configuration, whose task is looked up; `given` as `load`."""
     agent = agent_of(config, run.path, given)
-    env = make(task, config["delay"])
+    env = make(task, trained_delay(run.path))
     spec = spec_of(env)
     state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
     env.close()

@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 import imageio
 from tqdm import tqdm
 
+from delayrl.delays import DelayLike
 from delayrl.envs import make
 from delayrl.envs.making import name_of
 from delayrl.envs.task import TaskLike
 from delayrl.errors import DelayRLError, first_line
 from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
-from delayrl.play.policy import Policy, load, task_of
+from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run
 
@@ -39,7 +40,7 @@ class Moment(NamedTuple):
 def watch(
     run: str | Path,
     out: str | Path,
-    delay: int | str | None = None,
+    delay: DelayLike | None = None,
     seed: int = 0,
     camera: str | None = None,
     compare: str | Path | None = None,
@@ -87,7 +88,7 @@ def watch(
             task = task_of(path, env, env_kwargs)
             own = agent if config["agent"] == configs[0]["agent"] else None
             policy = load(path, task, agent=own)
-            served = servable(task, config["delay"] if delay is None else delay, policy.spec)
+            served = servable(task, trained_delay(path) if delay is None else delay, policy.spec)
             played = make(task, served, render_mode="rgb_array")
             stack.callback(close, played)
             rate = float(played.metadata.get("render_fps") or 30)

@@ -50,7 +50,7 @@ class Condition:
     @property
     def place(self) -> str:
         """The task and the delay as folders are named by them: without brackets at the ends, and not too long."""
-        return f"{self.env.strip('<>() ')[:100]}-delay{self.label}"
+        return f"{self.env.strip('<>() ')[:100]}-delay{str(self.label).strip('<>() ')}"
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def resolve(
     task = as_task(env)
     parsed = delay_of(task, delay)
     text = parsed.plain()
-    if not isinstance(delay, int | float | str) and as_delay(text) != parsed:
+    if not isinstance(delay, int | float | str) and "<" not in str(text) and as_delay(text) != parsed:
         raise DelayRLError(
             f"a run keeps its delay as text, and {str(parsed)[:60]!r} cannot be read back: use delayrl.delays"
         )

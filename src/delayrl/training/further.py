@@ -8,6 +8,7 @@ from typing import Any
 from delayrl.agents.registry import AGENTS, Registration
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
+from delayrl.play.policy import trained_delay
 from delayrl.run.agents import AgentLike, as_agent, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
@@ -59,7 +60,8 @@ def go_on(
     configs = [one.config for one in runs]
     task = stored_task(configs[0]["env"], runs[0].path, env, env_kwargs)
     registration = find_agent(configs[0]["agent"], runs[0].path) if agent is None else as_agent(agent).registration
-    setup = setup_of(configs[0], configs[0]["agent"] if agent is None else agent, registration, task, steps)
+    named = configs[0]["agent"] if agent is None else agent
+    setup = setup_of(configs[0], named, registration, task, trained_delay(runs[0]), steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     for one, config in zip(runs, configs, strict=True):
@@ -80,15 +82,15 @@ def go_on(
     return runs[0] if folder.exists else runs
 
 
-def setup_of(config: Mapping[str, Any], agent: AgentLike, registration: Registration, task: Task, steps: int) -> Setup:
+def setup_of(
+    config: Mapping[str, Any], agent: AgentLike, registration: Registration, task: Task, delay: Delay, steps: int
+) -> Setup:
     """Return the setup of a run with this configuration that is to have `steps` steps."""
     stored = {**config["hyperparameters"], **config["schedule"]}
     preset = registration.presets[config["preset"]]
     known = {*values_of(preset.agent), *values_of(preset.schedule)} if config["agent"] in AGENTS else set()
     older = {name: value for name, value in OLDER.items() if name in known}
-    setup = resolve(
-        agent, task, config["delay"], config["preset"], config["protocol"], {**older, **stored, "steps": steps}
-    )
+    setup = resolve(agent, task, delay, config["preset"], config["protocol"], {**older, **stored, "steps": steps})
     origin = dict(config.get("origin", {}))
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]

@@ -1,0 +1,139 @@
+"""Laws of users: classes of their own, named `module:Class(argument=value)` or by an entry point.
+
+A law of one's own is a frozen dataclass with `maximum` and `draw`. `OwnLaw` makes a `DelayLaw` of it: it checks each
+travel time, adds what a delay of the actions adds, and writes the text that a run keeps.
+"""
+
+import re
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from delayrl.delays.laws import whole_steps
+from delayrl.errors import DelayRLError
+from delayrl.lookup import (
+    came_with,
+    entry_points,
+    find_object,
+    name_of_object,
+    one_line,
+    parse_arguments,
+    public_name,
+    with_arguments,
+)
+
+GROUP = "delayrl.delays"
+PAGE = "docs/delays.md shows one"
+
+
+class UserLaw(Protocol):
+    """What a law of one's own must have: see `delayrl.delays.DelayLaw`."""
+
+    @property
+    def maximum(self) -> int:
+        """The longest delay."""
+
+    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
+        """Draw the travel time of the next message, and the state for the one after it."""
+
+
+@dataclass(frozen=True)
+class OwnLaw:
+    """A law of a user.
+
+    Attributes:
+        law: draws; None where a run has no name for it.
+        text: names it: `module:Class(argument=value)`, or `<Class:maximum>` if it cannot be imported.
+        maximum: the longest delay.
+        later: steps that are added to each travel time.
+    """
+
+    law: UserLaw | None
+    text: str
+    maximum: int
+    later: int = 0
+
+    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
+        """Draw from the user's law. Raises DelayRLError for a travel time that is not in 0..maximum, or no law."""
+        if self.law is None:
+            raise DelayRLError(f"{self.text} has no name that it could be imported by: give it again, as delay")
+        travel, state = self.law.draw(state, random)
+        travel = whole_steps(travel) + self.later
+        if travel > self.maximum:
+            longest = self.maximum - self.later
+            raise DelayRLError(f"{self.text} drew {travel - self.later} steps, and its maximum is {longest}")
+        return travel, state
+
+    def shifted(self, steps: int) -> Self:
+        """Return the law with travel times that are longer by `steps`. Its text does not say so."""
+        return replace(self, maximum=self.maximum + steps, later=self.later + steps)
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def is_law(thing: Any) -> bool:
+    """Return whether something, an instance or a class, is meant to be a law of a user."""
+    return hasattr(thing, "draw")
+
+
+def own_law(law: Any) -> OwnLaw:
+    """Return the law that a user gave, with its text. Raises DelayRLError if it is a class, or has no good maximum."""
+    kind = type(law)
+    if isinstance(law, type):
+        raise DelayRLError(f"a law is an instance: give {law.__name__}(…) for the class {law.__name__}")
+    if not hasattr(law, "maximum"):
+        raise DelayRLError(f"{kind.__name__} is no law of delays, because it lacks maximum: {PAGE}")
+    maximum, name = whole_steps(law.maximum), name_of_object(kind)
+    unnamed = OwnLaw(law, f"<{kind.__name__}:{maximum}>", maximum)
+    if name.startswith("<") or not is_dataclass(kind):
+        return unnamed
+    kwargs = {field.name: getattr(law, field.name) for field in fields(law) if field.init}
+    try:
+        text = with_arguments(public_name(name, GROUP), kwargs)
+        return OwnLaw(law, text, maximum) if _made(name, kind, text) == law else unnamed
+    except (TypeError, DelayRLError):  # arguments that JSON cannot hold, or that do not make it again
+        return unnamed
+
+
+def find_law(text: str, stored: Path | None = None) -> OwnLaw | None:
+    """Return the law that a text names, or None if the text is not one of a user's law.
+
+    Args:
+        text: `module:Class`, or the name of an entry point, with arguments in brackets; or `<Class:maximum>`.
+        stored: the run folder that says so. It may name classes of laws, and no code that came with it.
+
+    Raises:
+        DelayRLError: the law cannot be imported or made, or the folder may not name it.
+    """
+    if unnamed := re.fullmatch(r"<[^<>:]+:(\d{1,6})>", text):
+        return OwnLaw(None, text, whole_steps(int(unnamed[1])))
+    match = re.fullmatch(r"([^\W\d][\w.-]*(?::[^\W\d][\w.]*)?)\s*(\(.*)?", text)
+    source = match and (match[1] if ":" in match[1] else entry_points(GROUP).get(match[1]))
+    if not match or not source:
+        return None
+    if stored is not None and came_with(source, stored):
+        line = f"{stored} came with a law of delays that could run any code, {source}"
+        raise DelayRLError(f"{line}: if you mean it, move its module out of that folder")
+    kind = find_object(source)
+    if not (isinstance(kind, type) and is_dataclass(kind) and is_law(kind)):
+        raise DelayRLError(f"{source} is no law of delays, because it is no dataclass with draw: {PAGE}")
+    return own_law(_made(source, kind, text))
+
+
+def _made(name: str, kind: Any, text: str) -> Any:
+    """Return the law of this class with the arguments in brackets of the text; lists are given as tuples."""
+    try:
+        kwargs, rest = parse_arguments(text.partition("(")[2] or ")")
+    except ValueError:
+        rest = text
+    if rest:
+        raise DelayRLError(f"cannot read the law {text!r}; write e.g. {name}(rate=0.1), with values as JSON")
+    with one_line(f"the law {text!r} cannot be made"):
+        return kind(**{key: _as_tuples(value) for key, value in kwargs.items()})
+
+
+def _as_tuples(value: Any) -> Any:
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value

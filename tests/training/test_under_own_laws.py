@@ -1,0 +1,64 @@
+"""Laws of delays of a user are trained under, resumed, evaluated and exported."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import delayrl
+from delayrl.bench.grid import load_grid
+from delayrl.deploy import export_run
+from delayrl.errors import DelayRLError
+from delayrl.play.evaluation import evaluate, sweep
+from delayrl.run.condition import resolve
+from own_laws import Burst
+from short_runs import arrays, killed_and_resumed, train
+
+BURST = "own_laws:Burst(length=2, rate=0.3, steps=3)"
+
+
+@pytest.fixture(autouse=True)
+def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking for modules in the working folder changes the path for good."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+def test_a_named_law(tmp_path: Path) -> None:
+    """Instance and text are one condition, in a grid too. The run is loaded by the text alone."""
+    run = train("random", tmp_path / "run", delay=Burst(0.3))
+    assert run.config["delay"] == BURST
+    assert {row["delay"] for row in run.read("rows")} == {BURST}
+    assert train("random", tmp_path / "run", delay="own_laws:Burst(rate=0.3)").path == run.path
+    with pytest.raises(DelayRLError, match="holds a run with another delay"):
+        train("random", tmp_path / "run", delay=Burst(0.4))
+    assert evaluate(run.path, 2)["delay"] == BURST
+    assert delayrl.load(run.path).spec.delay == 3
+    file = tmp_path / "mine.toml"
+    file.write_text('agents = ["bpql"]\ntasks = ["Pendulum-v1"]\ndelays = ["own_laws:Burst(rate=0.3)"]\n')
+    (cell,) = load_grid(file).cells
+    assert cell.condition.delay == BURST
+    assert cell.id == resolve("bpql", "Pendulum-v1", Burst(0.3), "paper", "corrected", {}).cell_id([0])
+    assert cell.condition.place == "Pendulum-v1-delayown_laws:Burst(length=2, rate=0.3, steps=3"
+
+
+def test_a_law_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> None:
+    """Trained, killed and resumed with it, a run is the same as under the law's name; only playing needs it again."""
+
+    @dataclass(frozen=True)
+    class Local(Burst):
+        pass
+
+    run: Any = killed_and_resumed("bpql", tmp_path / "local", monkeypatch, delay=Local(0.3))
+    named = train("bpql", tmp_path / "named", delay=Burst(0.3))
+    assert run.config["delay"] == "<Local:3>"
+    for name, array in arrays(named).items():
+        np.testing.assert_array_equal(array, arrays(run)[name])
+    assert delayrl.load(run.path).spec == delayrl.load(named.path).spec
+    with pytest.raises(DelayRLError, match="<Local:3> has no name that it could be imported by: give it again, as del"):
+        evaluate(run.path, 1)
+    assert evaluate(run.path, 2, delay=Local(0.3))["returns"] == evaluate(named.path, 2)["returns"]
+    assert len(list(sweep(run.path, 1))) == 4
+    assert export_run(run.path, tmp_path / "bundle")["ages"] == [0, 3]
