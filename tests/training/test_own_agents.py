@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 
 import delayrl
 import own_agents
@@ -19,12 +20,13 @@ from delayrl.core.types import Spec
 from delayrl.deploy import export_run, load_bundle
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import evaluate, sweep
+from delayrl.play.video import watch
 from delayrl.run.agents import as_agent, find_agent, known_agents
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.condition import overrides_of, resolve
 from delayrl.run.folder import Run
 from own_agents import Shrink
-from own_tasks import make_arm, write_module
+from own_tasks import Arm, make_arm, write_module
 from short_runs import arrays, declare
 
 SHORT: dict[str, Any] = {"steps": 250, "random_steps": 100, "replay_capacity": 100, "evaluate_every": 250}
@@ -100,6 +102,36 @@ def test_an_agent_without_a_name_is_given_again(tmp_path: Path, capsys) -> None:
     info = {"age": 1, "actions": np.full((3, 1), 0.5)}
     action = load_bundle(tmp_path / "bundle")(np.ones(1), info["actions"], 1)
     np.testing.assert_allclose(action, policy.act(np.ones(1), info), atol=1e-6)
+
+
+class Drawn(Arm):
+    """An arm with a picture."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self) -> np.ndarray:
+        return np.zeros((240, 240, 3), np.uint8)
+
+
+def drawn_arm(**kwargs: Any) -> TimeLimit:
+    return TimeLimit(Drawn(**kwargs), 5)
+
+
+def test_a_video_of_an_agent_without_a_name(tmp_path: Path) -> None:
+    """Beside another agent, which is what its own run says."""
+    own, other = (
+        delayrl.train(agent, drawn_arm, 3, out=tmp_path / name, **SHORT)
+        for agent, name in ((own_agents.DELAYED, "own"), ("random", "other"))
+    )
+    with pytest.raises(DelayRLError, match="<Shrink> has no name"):
+        watch(own.path, tmp_path / "one.gif", env=drawn_arm)
+    given = {"env": drawn_arm, "agent": own_agents.DELAYED}
+    moments = watch(own.path, tmp_path / "two.gif", compare=other.path, **given)
+    assert [moment.step for moment in moments] == [5, 5]
 
 
 def test_from_the_command_line(tmp_path: Path, monkeypatch, capsys) -> None:
