@@ -16,7 +16,16 @@ ROOMS = "errors lookup delays wrappers envs core agents run play training report
 ROOMS += "__init__ __main__"
 """Folders and files at the top, lowest first: each imports only what stands before it."""
 ROOM = {name: place for place, name in enumerate(ROOMS.split())}
-LIGHT = ("lookup", "wrappers", "delays", "deploy.runtime.controller", "bench.folders", "cli.main", "run.checkpoint")
+LIGHT = (
+    "lookup",
+    "wrappers",
+    "delays",
+    "deploy.runtime.controller",
+    "deploy.adapter",
+    "bench.folders",
+    "cli.main",
+    "run.checkpoint",
+)
 
 
 def modules() -> dict[str, Path]:
@@ -84,7 +93,7 @@ def test_a_circle_is_noticed(circle: dict[str, set[str]]) -> None:
 
 def test_few_rooms_and_arrows() -> None:
     assert len(ROOM) <= 17
-    assert len(arrows(graph())) <= 64
+    assert len(arrows(graph())) <= 66
 
 
 def test_agents_know_no_environment_replay_or_loop() -> None:

@@ -208,31 +208,6 @@ def stored_delay(text: int | str, folder: Path) -> Delay:
     return Delay(**DelayParser(str(text), folder=folder).channels())
 
 
-def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
-    """Say how long a delay is in the unit that was not given.
-
-    Args:
-        given: what the user wrote, `80` or `80ms`.
-        delay: what it was read as.
-        step_seconds: the length of an environment step.
-
-    Returns:
-        "80 steps = 3.2 s" for a delay in steps, "2 steps of 40 ms" for one in time; of a random delay the longest.
-    """
-    count = "1 step" if delay.maximum == 1 else f"{delay.maximum} steps"
-    if not (delay.observation.constant and delay.action.constant):
-        count = f"up to {count}"
-    try:
-        as_delay(given)
-    except DelayRLError:  # a time, which cannot be read without the length of a step
-        return f"{count} of {_time(step_seconds)}"
-    return f"{count} = {_time(delay.maximum * step_seconds)}"
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.4g} s" if seconds >= 1 else f"{1000 * seconds:.4g} ms"
-
-
 def short_label(text: int | str) -> int | str:
     """Replace long lists of numbers in a delay's text by their checksum, for rows and names of folders."""
     if isinstance(text, int):

@@ -14,12 +14,21 @@ from delayrl.deploy.runtime.episode import ClockError as ClockError
 from delayrl.deploy.runtime.telemetry import Statistics as Statistics
 
 if TYPE_CHECKING:
+    from delayrl.deploy.adapter import AdaptedPolicy as AdaptedPolicy
+    from delayrl.deploy.adapter import adapt as adapt
+    from delayrl.deploy.adapter import export_layers as export_layers
+    from delayrl.deploy.adapter import stable_baselines_layers as stable_baselines_layers
     from delayrl.deploy.bundle import Bundle as Bundle
     from delayrl.deploy.bundle import load_bundle as load_bundle
     from delayrl.deploy.export import export_run as export_run
 
+LATER = {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"} | dict.fromkeys(
+    ("AdaptedPolicy", "adapt", "export_layers", "stable_baselines_layers"), "adapter"
+)
+"""Names that are imported when they are asked for, and their modules."""
+
 
 def __getattr__(name: str) -> Any:
-    if module := {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"}.get(name):
+    if module := LATER.get(name):
         return getattr(import_module(f"delayrl.deploy.{module}"), name)
     raise AttributeError(f"module 'delayrl.deploy' has no attribute {name!r}")

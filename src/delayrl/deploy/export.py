@@ -1,19 +1,15 @@
 """Export a run folder as a bundle. Apart from the backend `jax`, only this module of the package needs JAX."""
 
-import warnings
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
 
 from delayrl.deploy.backends.network import Arrays, Network
-from delayrl.deploy.backends.onnx_policy import onnx_graph
-from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, check_target, seal, write_files
+from delayrl.deploy.files import check_target, write_files
+from delayrl.deploy.packing import described, pack
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike
-from delayrl.errors import DelayWarning
 from delayrl.play.policy import Policy, restored, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
@@ -53,21 +49,8 @@ def export_run(
 
 
 def bundle_files(policy: Policy, metadata: dict[str, Any]) -> dict[str, bytes]:
-    """Return the files of a bundle: the policy's weights and graph, and a bundle.json of `metadata` and the network.
-
-    Without the package `onnx` the graph is left out, with a DelayWarning that says so.
-    """
-    network, arrays = network_of(policy)
-    metadata = metadata | {"policy": network.document()}
-    weights = safetensors.numpy.save(dict(sorted(arrays.items())))
-    files = {WEIGHTS: weights}
-    if find_spec("onnx") is None:
-        line = f"the bundle has no {GRAPH}, because the package onnx is not installed: pip install 'delayrl[deploy]', "
-        warnings.warn(line + "then export again with --force", DelayWarning, stacklevel=2)
-    else:
-        files[GRAPH] = onnx_graph(network, arrays, metadata)
-    check_files("the new bundle", metadata, files)
-    return seal(metadata, files)
+    """Return the files of a bundle of a policy, with a bundle.json of `metadata` and the network."""
+    return pack(*network_of(policy), metadata)
 
 
 def network_of(policy: Policy) -> tuple[Network, Arrays]:
@@ -109,8 +92,8 @@ def describe(run: Run, step: int, longest: int, task: Task) -> dict[str, Any]:
         "ages": [0, longest],
         "action_delay": env.delay.action.maximum,
         "dt": seconds_of(env),
-        "observation": _space(env.observation_space),
-        "action": _space(env.action_space),
+        "observation": described(env.observation_space),
+        "action": described(env.action_space),
         "normalisation": {
             "observation": "inside the first layers: the bundle takes the task's own numbers"
             if config["schedule"].get("observation_norm") == "running"
@@ -122,12 +105,6 @@ def describe(run: Run, step: int, longest: int, task: Task) -> dict[str, Any]:
         "trained_with": config.get("versions"),
         "exported_with": versions(),
     }
-
-
-def _space(space: Any) -> dict[str, Any]:
-    """Return a Box as JSON can hold it, with null for a missing bound."""
-    low, high = ([float(x) if np.isfinite(x) else None for x in bound] for bound in (space.low, space.high))
-    return {"shape": list(space.shape), "dtype": str(space.dtype), "low": low, "high": high}
 
 
 def _evaluation(run: Run, step: int) -> dict[str, Any] | None:

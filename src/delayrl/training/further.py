@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from delayrl.agents.registry import AGENTS, Registration
+from delayrl.delays import Delay
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import trained_delay

@@ -59,6 +59,9 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
     Other wrappers may stand between the two (`NormalizeObservation`, `TimeLimit`). Their observations are shown; the
     actions of the history are those that reached `Delayed`, in its units.
 
+    Attributes:
+        augment: makes the vector of an observation of `Delayed` and its `info`.
+
     Args:
         env: an environment with a `Delayed` in it. Its observations are still flat vectors, and its `info` is that of
             `Delayed`.
@@ -80,17 +83,17 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
         gym.Wrapper.__init__(self, env)
         history, delay = delayed.history, delayed.delay
         self.observation_space = _augmented_space(env.observation_space, delayed.action_space, history, delay)
-        self._augment = partial(_augment, history=history, delay=delay, dtype=self.observation_space.dtype)
+        self.augment = partial(_augment, history=history, delay=delay, dtype=self.observation_space.dtype)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start an episode."""
         obs, info = self.env.reset(seed=seed, options=options)
-        return self._augment(obs, info), info
+        return self.augment(obs, info), info
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
         """Issue an action. Returns the augmented state of the next step."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return self._augment(obs, info), reward, terminated, truncated, info
+        return self.augment(obs, info), reward, terminated, truncated, info
 
 
 class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):

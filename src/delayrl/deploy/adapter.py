@@ -1,0 +1,188 @@
+"""Policies of other libraries: any function in the `Controller`, and an MLP of the augmented state in a bundle.
+
+A function is code, so it runs in the program that has it. A bundle is data, so it takes the weights of an MLP with
+ReLU and a tanh at the end, the actor of most libraries' SAC and TD3.
+"""
+
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delayrl.deploy.backends.network import Network
+from delayrl.deploy.backends.numpy_policy import numpy_policy
+from delayrl.deploy.files import check_target, write_files
+from delayrl.deploy.packing import described, pack
+from delayrl.errors import DelayRLError
+from delayrl.wrappers import AugmentedObservation, Delayed
+from delayrl.wrappers.single import find_delayed, name_of, seconds_of
+
+SAMPLES, TOLERANCE = 200, 1e-4
+"""Inputs on which layers are compared with the policy that they are of, and their largest error, of the range."""
+
+
+@dataclass(frozen=True)
+class AdaptedPolicy:
+    """A function as a `ControlPolicy`, with the sizes of the environment that it was made for."""
+
+    function: Callable[..., ArrayLike]  # of the observation [S], the actions since [Δ, A] and the age
+    obs_size: int  # S
+    action_size: int  # A
+    low: NDArray[Any]  # the range of the actions, [A]
+    high: NDArray[Any]
+    max_age: int  # Δ, in steps
+    dt: float | None  # seconds a step; None if unknown
+    action_delay: int  # the part of the ages that actions take to act
+
+    def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
+        """Return the function's action, [A]."""
+        return np.asarray(self.function(obs, actions, age), np.float32)
+
+
+def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> AdaptedPolicy:
+    """Make a policy for the `Controller` of a function that was trained, or written, for an environment.
+
+    Args:
+        function: maps what `env` shows to an action [A] in its units. With an `AugmentedObservation` that is the
+            vector, [S + Δ·A + 1]; with `Delayed` alone the observation [S], the actions since [Δ, A] and the age.
+        env: the environment, with its `Delayed`; it is not played.
+
+    Raises:
+        DelayRLError: no `Delayed` in it, a wrapper outside of it that changes observations or actions, or a random
+            delay of the actions.
+    """
+    delayed, augmented = _layers_of(env)
+    history, delay = delayed.history, delayed.delay
+
+    def of_vector(obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> ArrayLike:
+        assert augmented is not None
+        vector = augmented.augment(obs, {"actions": actions, "age": age})
+        return function(np.asarray(vector, augmented.observation_space.dtype))
+
+    actions: Any = delayed.action_space
+    return AdaptedPolicy(
+        function if augmented is None else of_vector,
+        delayed.observation_space.shape[0],  # type: ignore[index]  # Delayed has checked that it is flat
+        actions.shape[0],
+        actions.low,
+        actions.high,
+        history,
+        seconds_of(env),
+        delay.action.maximum,
+    )
+
+
+def _layers_of(env: Any) -> tuple[Delayed, AugmentedObservation | None]:
+    delayed, augmented, layer = find_delayed(env), None, env
+    if delayed is None:
+        raise DelayRLError("adapt takes the environment that the policy was trained in, with its Delayed: got none")
+    if not delayed.delay.action.constant:
+        raise DelayRLError(f"a controller has one delay of the actions; got {delayed.delay.action}: use its longest")
+    while layer is not delayed:
+        if isinstance(layer, AugmentedObservation):
+            augmented = layer
+        elif isinstance(layer, gym.ObservationWrapper | gym.ActionWrapper):
+            name = type(layer).__name__
+            raise DelayRLError(f"{name} stands outside Delayed, where no controller runs it: put it inside")
+        layer = layer.env
+    inner = delayed if augmented is None else augmented
+    if (env.observation_space, env.action_space) != (inner.observation_space, delayed.action_space):
+        raise DelayRLError(f"wrappers outside {type(inner).__name__} change what the policy sees: put them inside")
+    return delayed, augmented
+
+
+def export_layers(
+    layers: Sequence[tuple[ArrayLike, ArrayLike]],
+    function: Callable[..., ArrayLike],
+    env: gym.Env[Any, Any],
+    out: str | Path,
+    *,
+    agent: str = "mlp",
+    force: bool = False,
+) -> dict[str, Any]:
+    """Write an MLP that was trained on `AugmentedObservation` as a bundle; return the bundle's metadata.
+
+    Args:
+        layers: the weights [inputs, outputs] and biases of each layer. The MLP has ReLU between them and a tanh at the
+            end, and -1 .. 1 is the range of the actions.
+        function: the policy, as for `adapt`. The layers are compared with it on random inputs of every age.
+        env: the environment that it was trained in, with an `AugmentedObservation`.
+        out: a new or empty folder.
+        agent: the name that the bundle gives.
+        force: replace a bundle in `out`.
+
+    Raises:
+        DelayRLError: as `adapt`; a range of actions that is not symmetric; layers that do not compute the function; a
+            folder that holds something else.
+    """
+    check_target(Path(out), force=force)
+    policy, (delayed, augmented) = adapt(function, env), _layers_of(env)
+    if augmented is None:
+        raise DelayRLError("a bundle takes a policy that was trained on AugmentedObservation")
+    half = np.asarray(policy.high, np.float64)
+    if not np.allclose(policy.low, -half, rtol=1e-6):
+        raise DelayRLError("a bundle takes actions with a range around 0: train with RescaleAction inside Delayed")
+    (first, bias), *rest = [(np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in layers]
+    sizes, delta = policy.obs_size, policy.max_age
+    shown: Any = augmented.observation_space.shape
+    if first.ndim != 2 or len(first) != shown[0]:
+        raise DelayRLError(f"the first layer must take the vector of size {shown[0]}; its weights are {first.shape}")
+    first = first.copy()
+    first[sizes : sizes + delta * len(half)] *= np.tile(half, delta)[:, None]  # a bundle's network reads -1 .. 1
+    arrays = {
+        f"head.{i}.{name}": np.ascontiguousarray(array, np.float32)
+        for i, layer in enumerate([(first, bias), *rest])
+        for name, array in zip("wb", layer, strict=True)
+    }
+    hidden = tuple(len(b) for _, b in [(first, bias), *rest][:-1])
+    low, high = (tuple(np.asarray(bound, np.float32).tolist()) for bound in (policy.low, policy.high))
+    network = Network(sizes, len(half), delta, low, high, "augmented" if delta else "observation", hidden)
+    network.check(arrays)
+    _check_same(network, arrays, policy)
+    metadata = {
+        "agent": agent,
+        "env": name_of(env),
+        "delay": delayed.delay.acted().label(),
+        "ages": [0, delta],
+        "action_delay": policy.action_delay,
+        "dt": policy.dt,
+        "observation": described(delayed.observation_space),
+        "action": described(delayed.action_space),
+        "exported_with": {"python": platform.python_version(), "numpy": np.__version__, "gymnasium": gym.__version__},
+    }
+    write_files(Path(out), pack(network, arrays, metadata), force=force)
+    return metadata
+
+
+def _check_same(network: Network, arrays: dict[str, Any], policy: AdaptedPolicy) -> None:
+    """Raise DelayRLError unless the network and the policy give the same actions."""
+    act, random = numpy_policy(network, arrays), np.random.default_rng(0)
+    for sample in range(SAMPLES):
+        age = sample % (policy.max_age + 1)
+        obs = (random.normal(size=policy.obs_size) * random.choice([0.1, 1.0])).astype(np.float32)
+        actions = np.zeros((policy.max_age, policy.action_size), np.float32)
+        actions[:age] = random.uniform(policy.low, policy.high, (age, policy.action_size))
+        error = float(np.max(np.abs(act(obs, actions, age) - policy(obs, actions, age)) / (policy.high - policy.low)))
+        if not error <= TOLERANCE:
+            what = "with ReLU between them and a tanh at the end"
+            raise DelayRLError(f"the layers, {what}, do not compute the policy: at age {age} it is {error:.2g} off")
+
+
+def stable_baselines_layers(model: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Return the layers of the actor of a SAC, TD3 or DDPG of Stable-Baselines3, for `export_layers`.
+
+    Raises:
+        DelayRLError: a model without an actor of its own, such as PPO, whose policy no bundle can hold.
+    """
+    actor = getattr(getattr(model, "policy", None), "actor", None)
+    if actor is None:
+        name = type(model).__name__
+        raise DelayRLError(f"{name} has no actor that a bundle can hold; SAC, TD3 and DDPG do. Use adapt in Python")
+    state = {name: tensor.detach().cpu().numpy() for name, tensor in actor.state_dict().items()}
+    names = [name.removesuffix(".weight") for name in state if name.endswith(".weight")]
+    return [(state[f"{n}.weight"].T, state[f"{n}.bias"]) for n in names if not n.startswith("log_std")]
