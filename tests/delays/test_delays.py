@@ -309,6 +309,10 @@ def test_recordings_in_odd_forms(tmp_path: Path) -> None:
     assert recorded(tmp_path / "table.npy") == Recorded((3, 4))
     (tmp_path / "a+b@c=d.csv").write_text("2\n")
     assert as_delay(f"recorded:{tmp_path / 'a+b@c=d.csv'}+action=1").maximum == 3
+    assert as_delay(f"episode:recorded:{tmp_path / 'a+b@c=d.csv'}@fifo").observation == Channel(
+        PerEpisode(Recorded((2,))), "fifo"
+    )
+    assert as_delay(f"episode:recorded:{tmp_path / 'a+b@c=d.csv'}").plain() == "episode:recorded:2,"
     np.save(tmp_path / "complex.npy", np.array([1j]))
     np.savez(tmp_path / "zip.npz", a=np.ones(2))
     (tmp_path / "zip.npz").rename(tmp_path / "zip.npy")
