@@ -10,6 +10,7 @@ import pytest
 
 import delayrl
 from delayrl.bench.grid import load_grid
+from delayrl.delays import PerEpisode, as_delay
 from delayrl.deploy import export_run
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import evaluate, sweep
@@ -62,3 +63,19 @@ def test_a_law_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> Non
     assert evaluate(run.path, 2, delay=Local(0.3))["returns"] == evaluate(named.path, 2)["returns"]
     assert len(list(sweep(run.path, 1))) == 4
     assert export_run(run.path, tmp_path / "bundle")["ages"] == [0, 3]
+
+
+def test_a_law_of_ones_own_in_each_episode() -> None:
+    """By its text and by an instance: the same delay, drawn once for an episode."""
+    text = "episode:own_laws:Burst(rate=0.5, steps=4)"
+    delay = as_delay(text)
+    assert delay == as_delay(PerEpisode(Burst(rate=0.5, steps=4)))
+    assert as_delay(delay.plain()) == delay
+    assert delay.maximum == 4
+    law, random = delay.observation.law, np.random.default_rng(0)
+    drawn = set()
+    for _ in range(20):
+        travel, state = law.draw(0, random)
+        drawn.add(travel)
+        assert {(law.draw(state, random)[0]) for _ in range(5)} == {travel}
+    assert drawn == {1, 4}

@@ -42,7 +42,7 @@ the observation may go back in time."""
 StepSeconds = float | Callable[[], float | None] | None
 """The length of an environment step, or a function that returns it; None if it is unknown."""
 NO_DELAY = Constant(0)
-OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, OwnLaw)
+OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, PerEpisode, Sum, OwnLaw)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 
 from delayrl.delays.laws import DelayLaw, uniform
+from delayrl.delays.own import own_law
 from delayrl.errors import DelayRLError
 
 
@@ -18,6 +19,10 @@ class PerEpisode:
     """
 
     law: DelayLaw
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.law, "shifted"):  # as all laws of ours have
+            object.__setattr__(self, "law", own_law(self.law))
 
     @property
     def maximum(self) -> int:
