@@ -65,7 +65,7 @@ def train(
         env_kwargs: keyword arguments of the environment. With `wrappers` and `flatten` they are part of its name.
         wrappers: as `make`.
         flatten: as `make`.
-        preset: "paper" or "small": which hyperparameters to start from.
+        preset: "paper", "matched" or "small": which hyperparameters to start from (docs/cli.md).
         seed: fixes everything: environments, networks, sampling.
         seeds: trains the seeds seed .. seed + seeds - 1 in lockstep, or those of a list.
         out: the run folder; with several seeds the folder of their run folders.
