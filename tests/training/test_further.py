@@ -118,6 +118,9 @@ def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: py
     new = train("vdpo", tmp_path / "vdpo", steps=100, start_from=old.path, progress=True)
     assert "taken over: reference.actor, reference.critic, reference.target" in capsys.readouterr().err
     assert np.abs(arrays(new)["reference.critic.0.0.w"] - arrays(old)["critic.0.0.w"]).max() < 5e-3
+    back = train("bpql", tmp_path / "bpql", steps=100, delay=2, start_from=new, progress=True)
+    assert "taken over: critic, target, log_temperature; new: actor" in capsys.readouterr().err
+    assert np.abs(arrays(back)["critic.0.0.w"] - arrays(new)["reference.critic.0.0.w"]).max() < 5e-3
     with pytest.raises(delayrl.DelayRLError, match="sac has no network that fits: it lacks"):
         train("dcac", tmp_path / "dcac", start_from=old.path)
 

@@ -79,7 +79,8 @@ def _from_source(group: Group, state: TrainState, note: Callable[[str], None]) -
     assert group.source is not None
     agent, arrays = state.learner.agent, group.source.arrays("agent")
     fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
-    arrays |= {f"reference.{name}": array for name, array in arrays.items()}  # a reference is an agent of its own
+    inner = {name.removeprefix("reference."): array for name, array in arrays.items()}  # a reference is an agent itself
+    arrays = {f"reference.{name}": array for name, array in inner.items()} | inner | arrays
     taken, left = fitting(fresh, arrays)
     if not taken:
         where = group.source.path.parents[1]
