@@ -168,7 +168,7 @@ def test_full_disk(undisturbed, tmp_path: Path) -> None:
         "1",
     ]
     done = subprocess.run(
-        ["unshare", "-rm", "bash", "-c", SMALL_DISK, "-", str(disk), "240k", *command],
+        ["unshare", "-rm", "bash", "-c", SMALL_DISK, "-", str(disk), "280k", *command],
         env=os.environ | {"RUNS": str(disk / "runs"), "KEPT": str(kept)},
         capture_output=True,
         text=True,
