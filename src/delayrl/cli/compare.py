@@ -61,11 +61,11 @@ def run(given: argparse.Namespace) -> None:
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
     """Return name and values of each option in which configurations differ; "-" where one has no such option."""
-    options = [
-        {name: value for name, value in config.items() if name not in ABOUT and not isinstance(value, dict)}
-        | {name: value for part in config.values() if isinstance(part, dict) for name, value in part.items()}
-        for config in ({k: v for k, v in config.items() if k not in ABOUT} for config in configs)
-    ]
+    options: list[dict[str, Any]] = [{} for _ in configs]
+    for own, config in zip(options, configs, strict=True):
+        for name, value in config.items():
+            if name not in ABOUT:
+                own |= value if isinstance(value, dict) else {name: value}
     names = dict.fromkeys(name for own in options for name in own)
     rows = [[name, *(own.get(name, "-") for own in options)] for name in names]
     return [row for row in rows if any(value != row[1] for value in row[2:])]

@@ -23,8 +23,8 @@ def run(given: argparse.Namespace) -> None:
         config, curve = one.config, one.curve()
         done, steps = (int(curve.steps[-1]) if len(curve.steps) else 0), config["schedule"].get("steps", 0)
         last = float(curve.returns[-1].mean()) if done else None
-        rows.append({**{name: config.get(name) for name in names}, "step": done, "steps": steps, "return": last})
-        rows[-1]["run"] = str(one.path)
+        columns = {name: config.get(name) for name in names}
+        rows.append({**columns, "step": done, "steps": steps, "return": last, "run": str(one.path)})
     if given.json:
         print(json.dumps(rows))
         return

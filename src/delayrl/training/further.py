@@ -5,12 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from delayrl.agents.registry import AGENTS, Registration
+from delayrl.agents.registry import AGENTS
 from delayrl.delays import Delay
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import trained_delay
-from delayrl.run.agents import AgentLike, as_agent, find_agent
+from delayrl.run.agents import AgentLike, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
 from delayrl.run.folder import Run, as_run, seed_runs
@@ -60,9 +60,10 @@ def go_on(
     runs = seed_runs(folder.path)
     configs = [one.config for one in runs]
     task = stored_task(configs[0]["env"], runs[0].path, env, env_kwargs)
-    registration = find_agent(configs[0]["agent"], runs[0].path) if agent is None else as_agent(agent).registration
-    named = configs[0]["agent"] if agent is None else agent
-    setup = setup_of(configs[0], named, registration, task, trained_delay(runs[0]), steps)
+    if agent is None:
+        agent = str(configs[0]["agent"])
+        find_agent(agent, runs[0].path)  # refuses code that came with the folder
+    setup = setup_of(configs[0], agent, task, trained_delay(runs[0]), steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     for one, config in zip(runs, configs, strict=True):
@@ -83,13 +84,13 @@ def go_on(
     return runs[0] if folder.exists else runs
 
 
-def setup_of(
-    config: Mapping[str, Any], agent: AgentLike, registration: Registration, task: Task, delay: Delay, steps: int
-) -> Setup:
+def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Delay, steps: int) -> Setup:
     """Return the setup of a run with this configuration that is to have `steps` steps."""
     stored = {**config["hyperparameters"], **config["schedule"]}
-    preset = registration.presets[config["preset"]]
-    known = {*values_of(preset.agent), *values_of(preset.schedule)} if config["agent"] in AGENTS else set()
+    known: dict[str, Any] = {}
+    if config["agent"] in AGENTS:
+        preset = AGENTS[config["agent"]].presets[config["preset"]]
+        known = {**values_of(preset.agent), **values_of(preset.schedule)}
     older = {name: value for name, value in OLDER.items() if name in known}
     setup = resolve(agent, task, delay, config["preset"], config["protocol"], {**older, **stored, "steps": steps})
     origin = dict(config.get("origin", {}))

@@ -69,8 +69,9 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
 
 def source_of(run: Run) -> tuple[dict[str, Any], Checkpoint]:
     """Return what the configuration says of a run whose networks another one begins with, and its newest checkpoint."""
-    checkpoint, names = run.latest(), ("agent", "env", "delay", "seed", "configuration")
-    described = {name: run.config[name] for name in names if name in run.config}
+    checkpoint, config = run.latest(), run.config
+    names = ("agent", "env", "delay", "seed", "configuration")
+    described = {name: config[name] for name in names if name in config}
     return described | {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}, checkpoint
 
 

@@ -95,9 +95,20 @@ def train(
         setup = replace(setup, origin={"from": origin})
     numbers = seed_numbers(seed, seeds)
     runs = run_folders(setup.condition, numbers, out)
-    ways: dict[str, Any] = {"device": device, "threads": threads, "track": track, "progress": progress, "slim": slim}
-    ways["callback"] = callback
-    train_group(setup, numbers, runs, given=delay, overwrite=overwrite, source=source, **ways)
+    train_group(
+        setup,
+        numbers,
+        runs,
+        given=delay,
+        device=device,
+        threads=threads,
+        track=track,
+        overwrite=overwrite,
+        progress=progress,
+        slim=slim,
+        source=source,
+        callback=callback,
+    )
     return runs[0] if seeds == 1 else runs
 
 
