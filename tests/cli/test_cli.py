@@ -79,17 +79,26 @@ def watch(*words: object) -> subprocess.CompletedProcess[str]:
     return done
 
 
-@pytest.mark.parametrize(("kind", "frames", "rest"), [("gif", 26, []), ("mp4", 51, ["--compare"])])
-def test_watch(run: Path, kind: str, frames: int, rest: list[str], tmp_path: Path) -> None:
-    """Reacher has 50 frames a second, of which a GIF shows every second."""
+@pytest.mark.parametrize(
+    ("kind", "frames", "rest", "said"),
+    [
+        ("gif", 18, [], ": 50 steps, return -"),
+        ("gif", 26, ["--seconds", "2"], ": episode 2, 21 steps, return -"),  # the last of 18 stays 0.5 s, then 8
+        ("mp4", 51, ["--compare"], ": 50 steps, return -"),
+    ],
+)
+def test_watch(run: Path, kind: str, frames: int, rest: list[str], said: str, tmp_path: Path) -> None:
+    """Reacher has 50 frames a second, of which a GIF shows every third, and the last."""
     out = tmp_path / f"episode.{kind}"
-    done = watch(run, "--out", out, *rest, *([run] if rest else []))
+    compare = rest == ["--compare"]
+    done = watch(run, "--out", out, *rest, *([run] if compare else []))
     assert done.stderr == ""
-    assert done.stdout.count("50 steps, return -") == (2 if rest else 1)
+    assert said in done.stdout
+    assert done.stdout.count("steps, return -") == (2 if compare else 1)
     look = "import sys, imageio.v3; v = imageio.v3.imread(sys.argv[1]); print([*v.shape, int(v[-1, 60:].std())])"
     decoded = subprocess.run([sys.executable, "-c", look, str(out)], capture_output=True, text=True)
     *shape, contrast = json.loads(decoded.stdout)
-    assert shape == [frames, 480, 964 if rest else 480, 3]
+    assert shape == [frames, 480, 964 if compare else 480, 3]
     assert contrast > 10  # the last frame is not empty
 
 

@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from itertools import islice
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,8 +16,9 @@ import pytest
 import delayrl.play.video as video
 from delayrl.envs import make
 from delayrl.errors import DelayRLError
+from delayrl.play.evaluation import HELD_OUT, reset_seed
 from delayrl.play.picture import GAP, aim, beside, caption, moving_base
-from delayrl.play.video import Moment, _episode, _together
+from delayrl.play.video import Moment, _episode, _few_colours, _repeated, _together
 
 STILL = SimpleNamespace(act=lambda obs, info: np.zeros_like(info["actions"][0]))
 SIZE = (480, 480, 3)
@@ -58,7 +61,7 @@ def robot(picture):
 found = {}
 for name in ("Track-v0", "Camera-v0"):
     env = make(name, 1, render_mode="rgb_array")
-    first, *_, last = _episode(env, policy, 0, None, 5)
+    first, *_, last = _episode(env, policy, 0, None, 5, 1)
     env.unwrapped.mujoco_renderer.camera_id = -1  # Gymnasium's own
     cam = env.unwrapped.mujoco_renderer.viewer.cam
     cam.lookat[:] = 0, 0, 0
@@ -146,7 +149,7 @@ def test_caption() -> None:
     picture = np.full(SIZE, 255, np.uint8)
     empty = caption(picture, "", ["", "", ""])
     assert (empty[:50] < 128).all()
-    assert (empty[60:] == 255).all()
+    assert (empty[65:] == 255).all()
     for column, word in enumerate(("ended at 10,000", "age 50", "return -12,345.6")):
         words = ["", "", ""]
         words[column] = word
@@ -154,6 +157,19 @@ def test_caption() -> None:
         assert column * 160 <= drawn.min() < drawn.max() < (column + 1) * 160
     rows, _ = np.nonzero((caption(picture, "Mg", ["", "", ""]) != empty).any(2))
     assert np.ptp(rows) >= 12  # pixels: legible
+
+
+@pytest.mark.parametrize("letters", [1, 30, 60, 90])
+def test_a_long_title_fits(letters: int) -> None:
+    """All of it is in the picture, as large as a short one if there is room."""
+    picture = np.full(SIZE, 255, np.uint8)
+    heights = {}
+    for title in ("M", "M" * letters):
+        rows, columns = np.nonzero((caption(picture, title, [""]) != caption(picture, "", [""])).any(2))
+        assert columns.max() < 480 - 5
+        heights[title] = np.ptp(rows)
+    assert (columns.max() > 350) == (letters >= 30)
+    assert (heights["M" * letters] < heights["M"]) == (letters >= 30)
 
 
 def test_beside() -> None:
@@ -168,13 +184,13 @@ def test_moments_of_an_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every fourth step and the last, with the age that the policy was shown and the return until then."""
     monkeypatch.setattr(video, "render", lambda env: np.zeros(SIZE, np.uint8))
     env = make("delayrl/Walk-v0", 3)
-    moments = list(_episode(env, STILL, 5, None, 4))
+    moments = list(_episode(env, STILL, 5, None, 4, 1))
     assert env.spec is not None
     length = env.spec.max_episode_steps
     assert [moment.step for moment in moments] == sorted({*range(0, length + 1, 4), length})
     assert [moment.age for moment in moments[:3]] == [0, 3, 3]
     assert [moment.over for moment in moments] == [False] * (len(moments) - 1) + [True]
-    env.reset(seed=5)
+    env.reset(seed=reset_seed(5, HELD_OUT, 0))
     rewards = [float(env.step(np.zeros(1, np.float32))[1]) for _ in range(8)]
     assert [moment.total for moment in moments[:3]] == pytest.approx([0, sum(rewards[:4]), sum(rewards)])
 
@@ -183,10 +199,54 @@ def test_episodes_of_two_lengths() -> None:
     """The last moment of the shorter one stays."""
 
     def episode(name: str, length: int) -> Any:
-        return iter([Moment(name, step, 0, 0.0, step == length) for step in range(length + 1)])
+        return iter([Moment(name, 1, step, 0, 0.0, step == length) for step in range(length + 1)])
 
     pairs = [(a.step, b.step) for a, b in _together([episode("a", 1), episode("b", 3)])]
     assert pairs == [(0, 0), (1, 1), (1, 2), (1, 3)]
+
+
+def test_episodes_one_after_another() -> None:
+    """Each side begins its next one by itself, after the end of the last has been shown for two frames."""
+
+    def side(length: int) -> Any:
+        return lambda number: (Moment("", number, step, 0, 0.0, step == length) for step in range(length + 1))
+
+    pairs = [[(m.episode, m.step) for m in both] for both in islice(_repeated([side(1), side(3)], 2), 7)]
+    left, right = zip(*pairs, strict=True)
+    assert left == ((1, 0), (1, 1), (1, 1), (2, 0), (2, 1), (2, 1), (3, 0))
+    assert right == ((1, 0), (1, 1), (1, 2), (1, 3), (1, 3), (2, 0), (2, 1))
+
+
+def test_episodes_are_those_of_evaluate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second starts as the second of `evaluate` with the same seed; the camera is chosen once, before the first."""
+    aimed = []
+    monkeypatch.setattr(video, "aim", lambda env, camera: aimed.append(camera))
+    monkeypatch.setattr(video, "render", lambda env: env.unwrapped.state.copy())
+    env = make("Pendulum-v1", 3)
+    starts = [next(_episode(env, STILL, 5, "top", 4, number)).picture for number in (1, 2)]
+    for number, start in enumerate(starts):
+        env.reset(seed=reset_seed(5, HELD_OUT, number))
+        np.testing.assert_array_equal(start, env.unwrapped.state)
+    assert aimed == ["top"]
+
+
+def test_frames_of_a_gif_share_their_colours() -> None:
+    """What is the same in two frames stays the same number, and colours that the first lacks become its nearest."""
+    first = np.zeros((4, 4, 3), np.uint8)
+    first[:2] = 200, 100, 50
+    second = first.copy()
+    second[0, 0] = 190, 110, 50
+    one = _few_colours(first, [])
+    two = _few_colours(second, [one])
+    assert one.getpalette() == two.getpalette()
+    np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(np.asarray(one.convert("RGB")), first)
+
+
+@pytest.mark.parametrize("seconds", [0, -1, float("nan"), float("inf")])
+def test_a_length_of_nothing(tmp_path: Path, seconds: float) -> None:
+    with pytest.raises(DelayRLError, match="--seconds is a length above 0, such as 8; got"):
+        video.watch(tmp_path, tmp_path / "x.gif", seconds=seconds)
 
 
 def test_a_renderer_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,4 +255,4 @@ def test_a_renderer_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(video, "render", fail)
     with pytest.raises(DelayRLError, match=r"^delayrl/Walk-v0 cannot be rendered here: no pictures$"):
-        next(_episode(make("delayrl/Walk-v0", 3), STILL, 5, None, 4))
+        next(_episode(make("delayrl/Walk-v0", 3), STILL, 5, None, 4, 1))

@@ -15,6 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=whole, default=0, help="seed of the start state (default: 0)")
     add("--camera", metavar="NAME", help="a camera of the MuJoCo model (default: track, or one that follows the robot)")
     add("--compare", type=Path, metavar="RUN2", help="show a run on the same task beside it, from the same start state")
+    add("--seconds", type=float, metavar="S", help="length of the file, with further episodes (default: one episode)")
     add_stored(parser)
     add_env_kwargs(parser)
 
@@ -24,6 +25,8 @@ def run(given: argparse.Namespace) -> None:
     from delayrl.play.video import watch
 
     stored = {"env": given.env, "env_kwargs": dict(given.env_kwargs), "agent": given.agent}
-    moments = watch(given.run, given.out, given.delay, given.seed, given.camera, given.compare, **stored)
-    results = (f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
+    shown = (given.delay, given.seed, given.camera, given.compare, given.seconds)
+    moments = watch(given.run, given.out, *shown, **stored)
+    several = "" if given.seconds is None else "episode {0.episode}, "
+    results = (several.format(moment) + f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
     print(f"{given.out}: {'; beside it '.join(results)}")

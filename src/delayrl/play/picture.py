@@ -88,16 +88,22 @@ def close(env: Any) -> None:
 
 
 def caption(picture: Picture, title: str, words: Sequence[str]) -> Picture:
-    """Write a title, and below it words in columns, on a dark band at the top of a picture."""
+    """Write a title, and below it words in columns, on a dark band at the top of a picture.
+
+    A title that is wider than the picture gets smaller letters.
+    """
     height, width, _ = picture.shape
-    size = max(11, round(min(height, width) / 28))
+    size = max(11, round(min(height, width) / 26))
     image = Image.fromarray(picture).convert("RGB")
-    band = (0, 0, width, round(3.1 * size))
+    band = (0, 0, width, round(3.4 * size))
     image.paste(Image.blend(image.crop(band), Image.new("RGB", band[2:]), 0.65), band)
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(size)
-    draw.text((size / 2, size * 0.25), title, "white", font)
+    larger = (ImageFont.load_default(pixels) for pixels in range(round(1.25 * size), 5, -1))
+    fitting = next((font for font in larger if font.getlength(title) <= width - size), font)
+    draw.text((size / 2, size), title, "white", fitting, anchor="lm")
     for column, word in enumerate(words):  # columns, so that growing numbers move nothing
-        draw.text((size / 2 + column * width / len(words), size * 1.65), word, "white", font)
+        left = size / 2 + column * width / len(words)
+        draw.text((left, 2.55 * size), word, "white", font, anchor="lm")
     return np.asarray(image)
 
 

@@ -1,15 +1,18 @@
 """Render episodes of trained policies to a file, without a screen."""
 
+import math
 import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from itertools import chain
+from functools import partial
+from itertools import chain, count, islice, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import imageio
+from PIL import Image
 from tqdm import tqdm
 
 from delayrl.delays import DelayLike
@@ -23,14 +26,17 @@ from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import Run
 
-FASTEST = {".mp4": 60, ".gif": 25}
+FASTEST = {".mp4": 60, ".gif": 15}
 """Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""
+PAUSE = 0.5  # seconds that the end of an episode is shown
+COLOURS = 64  # of a .gif file
 
 
 class Moment(NamedTuple):
     """An episode up to one of its steps."""
 
     picture: Picture
+    episode: int  # from 1
     step: int
     age: int  # of the observation that the policy is shown, in steps
     total: float  # the return so far
@@ -44,6 +50,7 @@ def watch(
     seed: int = 0,
     camera: str | None = None,
     compare: str | Path | None = None,
+    seconds: float | None = None,
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
@@ -51,7 +58,8 @@ def watch(
 ) -> list[Moment]:
     """Play an episode of a run's policy, and write it to an .mp4 or .gif file.
 
-    Step, age and return are written into the picture. The camera follows a robot that moves away.
+    Step, age and return are written into the picture, of several episodes also which it is. The camera follows a robot
+    that moves away.
 
     Args:
         run: the run folder.
@@ -59,22 +67,25 @@ def watch(
         delay: any delay that the policy can serve; None for the one it was trained for.
         seed: of the start state.
         camera: a camera of the MuJoCo model; None for `track`, or one that follows as it does.
-        compare: a second run on the same task, shown beside the first, from the same start state.
+        compare: a second run on the same task, shown beside the first, from the same start states.
+        seconds: the length of the file; an episode that ends before is followed by another one. None for one episode.
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of the environment that replace or complete the run's.
         agent: as `load`; of both runs if they name the same agent, else of the first.
 
     Returns:
-        The last moment of the run's episode, and of that of `compare`.
+        The last moment of the run's last episode, and of that of `compare`.
 
     Raises:
-        DelayRLError: another kind of file, no run, runs of two tasks, a delay longer than in training, no such camera,
-            no way to render.
+        DelayRLError: another kind of file, no length, no run, runs of two tasks, a delay longer than in training, no
+            such camera, no way to render.
     """
     out = Path(out)
     if out.suffix not in FASTEST:
         raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")
     check_seed(seed)
+    if seconds is not None and not 0 < seconds < math.inf:
+        raise DelayRLError(f"--seconds is a length above 0, such as 8; got {seconds:g}")
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # what pygame draws with
@@ -94,28 +105,33 @@ def watch(
             rate = float(played.metadata.get("render_fps") or 30)
             stride = max(1, round(rate / FASTEST[out.suffix]))
             titles.append(f"{config['agent']}, delay {served.label()}")
-            episodes.append(_episode(played, policy, reset_seed(seed, HELD_OUT, 0), camera, stride))
-        moments = _together(episodes)
+            episodes.append(partial(_episode, played, policy, seed, camera, stride))
+        if seconds is None:
+            moments = _together([begin(1) for begin in episodes])
+        else:
+            pause, frames = (max(1, round(time * rate / stride)) for time in (PAUSE, seconds))
+            moments = islice(_repeated(episodes, pause), frames)
         last = next(moments)  # before there is a file, because the first frame fails where nothing can be rendered
         moments = chain([last], moments)
         with _video(out, rate / stride) as add:
             for last in tqdm(moments, unit="frame", leave=False, disable=None):
-                add(beside([caption(m.picture, title, _words(m)) for title, m in zip(titles, last, strict=True)]))
+                add(beside([_titled(m, title, seconds is not None) for m, title in zip(last, titles, strict=True)]))
     return last
 
 
-def _episode(env: Any, policy: Policy, seed: int, camera: str | None, stride: int) -> Iterator[Moment]:
-    """Play an episode. Yields every `stride`-th moment of it, and the last."""
+def _episode(env: Any, policy: Policy, seed: int, camera: str | None, stride: int, number: int) -> Iterator[Moment]:
+    """Play the episode of this number, from 1. Yields every `stride`-th moment of it, and the last."""
     step, total, over = 0, 0.0, False
     try:
-        obs, info = env.reset(seed=seed)
-        aim(env, camera)
-        yield Moment(render(env), step, info["age"], total, over)
+        obs, info = env.reset(seed=reset_seed(seed, HELD_OUT, number - 1))  # as `evaluate` plays them
+        if number == 1:
+            aim(env, camera)
+        yield Moment(render(env), number, step, info["age"], total, over)
         while not over:
             obs, reward, terminated, truncated, info = env.step(policy.act(obs, info))
             step, total, over = step + 1, total + float(reward), terminated or truncated
             if over or step % stride == 0:
-                yield Moment(render(env), step, info["age"], total, over)
+                yield Moment(render(env), number, step, info["age"], total, over)
     except DelayRLError:
         raise
     except Exception as error:  # a renderer may raise anything
@@ -133,19 +149,44 @@ def _together(episodes: Sequence[Iterator[Moment]]) -> Iterator[list[Moment]]:
         yield moments
 
 
-def _words(moment: Moment) -> list[str]:
+def _repeated(episodes: Sequence[Callable[[int], Iterator[Moment]]], pause: int) -> Iterator[list[Moment]]:
+    """Play one episode after another, each side at its own pace and without end. `pause` frames show how one ended."""
+
+    def side(begin: Callable[[int], Iterator[Moment]]) -> Iterator[Moment]:
+        for number in count(1):
+            for moment in begin(number):
+                yield moment
+            yield from repeat(moment, pause - 1)  # the loop's last
+
+    return map(list, zip(*map(side, episodes), strict=True))
+
+
+def _titled(moment: Moment, title: str, several: bool) -> Picture:
+    """Write what is played, of `several` episodes which one, and how far it is, into a moment's picture."""
+    episode = f", episode {moment.episode}" if several else ""
     step = f"ended at {moment.step:,}" if moment.over else f"step {moment.step:,}"
-    return [step, f"age {moment.age}", f"return {moment.total:,.1f}"]
+    return caption(moment.picture, title + episode, [step, f"age {moment.age}", f"return {moment.total:,.1f}"])
 
 
 @contextmanager
 def _video(out: Path, rate: float) -> Iterator[Callable[[Any], None]]:
     """Open a video file, and yield the function that adds a frame. Raises DelayRLError if it cannot be written."""
-    options = {"fps": rate, "macro_block_size": None} if out.suffix == ".mp4" else {"duration": 1000 / rate, "loop": 0}
     try:
-        with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
-            warnings.simplefilter("ignore", RuntimeWarning)
-            with imageio.get_writer(out, **options) as writer:
-                yield writer.append_data
+        if out.suffix == ".gif":
+            with out.open("wb") as file:
+                frames: list[Image.Image] = []
+                yield lambda picture: frames.append(_few_colours(picture, frames[:1]))
+                frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=1000 / rate, loop=0)
+        else:
+            with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
+                warnings.simplefilter("ignore", RuntimeWarning)
+                with imageio.get_writer(out, fps=rate, macro_block_size=None) as writer:
+                    yield writer.append_data
     except OSError as error:
         raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def _few_colours(picture: Picture, first: Sequence[Image.Image]) -> Image.Image:
+    """Reduce a frame to the colours of the first one. Colours of its own would flicker, and take twice the space."""
+    image = Image.fromarray(picture)
+    return image.quantize(palette=first[0], dither=Image.Dither.NONE) if first else image.quantize(COLOURS)
