@@ -1,7 +1,10 @@
-"""Write the pictures and tables of the docs from committed rows alone: `python benchmarks/figures.py`."""
+"""Write the pictures and tables of the docs from committed files alone: `python benchmarks/figures.py`."""
 
 import json
 import runpy
+import subprocess
+import sys
+import tempfile
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ import numpy as np
 matplotlib.use("Agg")
 from learning import curves as learning
 from matplotlib import pyplot
+from PIL import Image
 from speed import tables as speed
 
 from delayrl.cli.main import main as delayrl
@@ -215,20 +219,27 @@ def insert(page: Path, key: str, text: str) -> None:
     page.write_text(head + begin + "\n" + text + "\n" + end + rest.split(end)[1])
 
 
-def first(root: Path) -> str:
-    """Write the report of the grid `first` to docs/results and return the part that the README shows."""
-    folder = root / "docs" / "results"
-    delayrl(["bench", "report", str(HERE / "results" / "first.sqlite"), "--out", str(folder)])
-    text = (folder / "report.md").read_text()
-    made = next(line for line in text.splitlines() if line.startswith("Made on"))
-    curves = "![Learning curves](docs/results/img/curves-0-0.png)"
-    return text[text.index("### Normalised return") : text.index("### Interquartile")] + f"{curves}\n\n{made}"
+def measured(out: Path) -> None:
+    """Draw what `delayrl measure` finds in the log of examples/make_log.py, as docs/measure.md shows it."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "arm.csv"
+        subprocess.run([sys.executable, HERE.parent / "examples" / "make_log.py", log], check=True)
+        delayrl(["measure", str(log), "--period", "20ms", "--plot", str(out)])
+
+
+def last_frame(video: Path) -> None:
+    """Write the last frame of a GIF beside it, for readers who switched motion off."""
+    with Image.open(video) as frames:
+        frames.seek(frames.n_frames - 1)
+        frames.convert("RGB").quantize(64).save(video.with_suffix(".png"), optimize=True)
 
 
 def main() -> None:
     """Write every generated picture and section of the docs."""
     root = HERE.parent
     images = root / "docs" / "img"
+    last_frame(images / "episodes.gif")
+    measured(images / "measure.png")
     words = {
         "vdpo": "VDPO, delay 5",
         "reference": "its reference, no delay",
@@ -241,7 +252,7 @@ def main() -> None:
         title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
         draw_against_delay("pusher-random", title, images / "pusher-delays.png", labels)
     for name, pages in {
-        "pendulum": ["README.md", "docs/algorithms/vdpo.md", "docs/benchmarks.md"],
+        "pendulum": ["README.md", "docs/index.md", "docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "walk": ["docs/benchmarks.md"],
         "walk-random": ["docs/benchmarks.md"],
@@ -261,7 +272,7 @@ def main() -> None:
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
     if (HERE / "results" / "first.sqlite").exists():
-        insert(root / "README.md", "first", first(root))
+        delayrl(["bench", "report", str(HERE / "results" / "first.sqlite"), "--out", str(root / "docs" / "results")])
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
