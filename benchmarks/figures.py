@@ -87,21 +87,16 @@ def table(name: str) -> str:
     by_agent = evaluations(name)
     means = {agent: [e["mean_return"] for _, e in runs] for agent, runs in by_agent.items()}
     anchors = "sac" in means and "random" in means
-    lines = ["| agent | delay | steps | mean return | each seed |" + (" normalised |" if anchors else "")]
-    lines.append("| --- | --- | --- | --- | --- |" + (" --- |" if anchors else ""))
+    titles = ["agent", "mean return", *(["normalised"] if anchors else []), "each seed", "delay", "steps"]
+    lines = ["| " + " | ".join(titles) + " |", "| --- " * len(titles) + "|"]
     for agent, runs in sorted(by_agent.items(), key=lambda item: -np.mean(means[item[0]])):
         config, evaluation = runs[0]
         seeds = " · ".join(f"{mean:.1f}" for mean in means[agent])
-        cells = [
-            f"`{agent}`",
-            evaluation["delay"],
-            f"{config['schedule']['steps']:,}",
-            f"{np.mean(means[agent]):.1f}",
-            seeds,
-        ]
+        cells = [f"`{agent}`", f"{np.mean(means[agent]):.1f}"]
         if anchors:
             low, high = np.mean(means["random"]), np.mean(means["sac"])
             cells.append(f"{(np.mean(means[agent]) - low) / (high - low):.2f}")
+        cells += [seeds, evaluation["delay"], f"{config['schedule']['steps']:,}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 

@@ -53,7 +53,7 @@ def test_the_rehearsal(late: int, tmp_path: Path, monkeypatch, capsys) -> None:
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
     monkeypatch.setattr(sys, "argv", ["rehearse.py", str(late)])
     exec(compile(code, "rehearse.py", "exec"), {})
-    steps, overruns, decisions = map(int, re.findall(r"(\d+)(?: steps;| of | overruns)", capsys.readouterr().out))
+    steps, overruns, decisions = map(int, re.findall(r"(\d+)(?: steps;| of | decisions)", capsys.readouterr().out))
     assert steps == decisions > 4
     assert overruns == (steps - 4 if late == 4 else 0)
 
