@@ -23,7 +23,9 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
 
     Args:
         env: any Gymnasium vector environment with flat Box observations and actions.
-        delay, history, fill: as `Delayed`.
+        delay: as `Delayed`.
+        history: as `Delayed`.
+        fill: as `Delayed`.
         step_seconds: the length of a step, for delays given as times; None to ask the environments.
 
     Raises:
