@@ -15,7 +15,7 @@ from delayrl.cli.console import Parser
 from delayrl.cli.main import COMMANDS, main
 from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
-from delayrl.run.folder import Run
+from short_runs import newest
 
 SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
 SMALL += ["--batch-size", "8", "--hidden", "8", "8", "--replay-capacity", "250"]
@@ -251,7 +251,7 @@ def test_stopped_run_goes_on(tmp_path: Path) -> None:
     assert process.returncode == 2
     assert "goes on from there" in err
     assert "Traceback" not in err
-    stopped = Run(tmp_path / "run").latest().step
+    stopped = newest(tmp_path / "run").step
     assert stopped > 0
     assert f"stopped at step {stopped:,}" in err
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import NormalizeObservation, TimeLimit
 
 import delayrl
 from delayrl.envs import delay_of
@@ -128,6 +128,22 @@ def test_wrappers_and_flat_observations() -> None:
     assert isinstance(env.env.env.env, TimeLimit)
     ends = [env.step(env.action_space.sample())[3] for _ in range(20)]
     assert ends == [False] * 19 + [True]
+
+
+def test_normalised_observations() -> None:
+    """As Gymnasium's wrapper between task and delay, outside of flattening; its moments can be read and stopped."""
+    ours = delayrl.make(Arm, 2, wrappers=[LIMIT, Camera], flatten=True, normalise=True)
+    theirs = delayrl.Delayed(NormalizeObservation(as_task(Arm, {}, [LIMIT, Camera], True).make()), 2)
+    shown = []
+    for env in (ours, theirs):
+        env.action_space.seed(0)
+        shown.append([env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(9))])
+    np.testing.assert_array_equal(*shown)
+    moments = ours.get_wrapper_attr("obs_rms")
+    assert (moments.mean.shape, round(moments.count)) == ((4,), 10)
+    ours.set_wrapper_attr("update_running_mean", False)
+    ours.step(ours.action_space.sample())
+    assert round(moments.count) == 10
 
 
 def test_the_limit_of_an_environment_without_a_spec() -> None:

@@ -23,8 +23,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Print the options that differ and the returns, and draw the learning curves."""
     from delayrl.play.plots import curves
+    from delayrl.play.run import seed_runs
     from delayrl.report.statistics import area, common_steps, mean_interval
-    from delayrl.run.folder import seed_runs
 
     if not 2 <= len(given.runs) <= len(LABELS):
         raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")

@@ -20,8 +20,9 @@ from delayrl.errors import DelayRLError, first_line
 from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of, trained_delay
+from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunLike
 
 FASTEST = {".mp4": 60, ".gif": 25}
 """Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""
@@ -38,12 +39,12 @@ class Moment(NamedTuple):
 
 
 def watch(
-    run: str | Path,
+    run: RunLike,
     out: str | Path,
     delay: DelayLike | None = None,
     seed: int = 0,
     camera: str | None = None,
-    compare: str | Path | None = None,
+    compare: RunLike | None = None,
     *,
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +17,11 @@ from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
+from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup, resolve
-from delayrl.run.folder import Run, as_run
+from delayrl.run.folder import RunFolder, RunLike
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.learner import compiled
@@ -32,6 +33,12 @@ from delayrl.wrappers import Delayed
 from delayrl.wrappers.single import limit_of
 
 
+@overload
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: Literal[1] = 1, **more: Any) -> Run: ...
+@overload
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: Sequence[int], **more: Any) -> list[Run]: ...
+@overload
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: int, **more: Any) -> Run | list[Run]: ...
 def train(
     agent: AgentLike,
     env: TaskLike,
@@ -50,11 +57,11 @@ def train(
     track: str | None = None,
     threads: int = 1,
     slim: bool = False,
-    start_from: str | Path | Run | None = None,
+    start_from: RunLike | None = None,
     callback: Callback | None = None,
     progress: bool = True,
     **values: Any,
-) -> Any:
+) -> Run | list[Run]:
     """Train an agent. The same call resumes an unfinished run, and returns a finished one.
 
     Args:
@@ -91,14 +98,14 @@ def train(
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
     source = None
     if start_from is not None:
-        origin, source = source_of(as_run(start_from))
+        origin, source = source_of(RunFolder(Path(start_from)))
         setup = replace(setup, origin={"from": origin})
     numbers = seed_numbers(seed, seeds)
-    runs = run_folders(setup.condition, numbers, out)
+    folders = run_folders(setup.condition, numbers, out)
     train_group(
         setup,
         numbers,
-        runs,
+        folders,
         given=delay,
         device=device,
         threads=threads,
@@ -109,13 +116,14 @@ def train(
         source=source,
         callback=callback,
     )
+    runs = [Run(folder.path) for folder in folders]
     return runs[0] if seeds == 1 else runs
 
 
 def train_group(
     setup: Setup,
     numbers: list[int],
-    runs: list[Run],
+    folders: list[RunFolder],
     *,
     given: DelayLike | None = None,
     device: str | None = None,
@@ -130,8 +138,7 @@ def train_group(
     """Train seeds in lockstep, each in its folder, from where these stand. The arguments are those of `train`."""
     if threads < 1:
         raise DelayRLError(f"threads must be at least 1; got {threads}")
-    observed = setup.delay.observed()
-    envs = [make(setup.task, observed, rescale=True) for _ in numbers]
+    envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
     if device != "gpu":
@@ -143,7 +150,7 @@ def train_group(
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
         apply = pool.map if threads > 1 else map
-        group = Group(setup, numbers, runs, keys, spec, shapes, program, apply, slim, source)
+        group = Group(setup, numbers, folders, keys, spec, shapes, program, apply, slim, source)
 
         def note(line: str) -> None:
             if progress:
