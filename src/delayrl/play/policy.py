@@ -10,6 +10,7 @@ from gymnasium.wrappers import RescaleAction
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State, template
+from delayrl.core.cache import keep_compiled
 from delayrl.core.types import Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, stored_delay
@@ -83,6 +84,7 @@ def load(
     Raises:
         DelayRLError: no run folder, no good checkpoint, one of another agent, a task that cannot be made.
     """
+    keep_compiled()
     run = RunFolder(Path(path))
     return restored(run, run.config, run.latest(), task_of(path, env, env_kwargs), agent)
 

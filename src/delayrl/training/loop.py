@@ -127,12 +127,10 @@ class Loop:
         first = schedule.first_update
         if not self._learning and first <= state.step < schedule.random_steps and not self._can_learn():
             first = state.step + 1  # there is still time
-        state.learner, metrics, learned = group.program.learn(
-            state.learner, state.pending, group.keys, state.step, first
-        )
+        state.learner, metrics, due = group.program.learn(state.learner, state.pending, group.keys, state.step, first)
         state.pending = []
         self._metrics |= metrics
-        if learned and not self._learning:
+        if due and not self._learning:
             self._learning = True
             if not self._can_learn():  # the first block's own steps count too
                 task = group.setup.condition.env

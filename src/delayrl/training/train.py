@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from tqdm import tqdm
 
 from delayrl.agents.base import PRODUCTS, State, template
+from delayrl.core.cache import keep_compiled
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
@@ -141,6 +142,7 @@ def train_group(
     envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
+    keep_compiled()
     if device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     precision = PRODUCTS[setup.schedule.precision]
