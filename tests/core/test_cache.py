@@ -67,3 +67,19 @@ def test_settings_of_jax_come_first(tmp_path: Path) -> None:
 def test_without_a_home_nothing_is_kept(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert compile_in(tmp_path / "file") == (None, 0)
+
+
+@pytest.mark.thorough
+def test_what_was_compiled_before_computes_the_same(tmp_path: Path) -> None:
+    """A run without the folder, one that fills it, and one that takes from it."""
+    words = "train bpql --env Pendulum-v1 --delay 2 --preset small --steps 300 --random-steps 100 --hidden 8 8 --quiet"
+    networks = []
+    for name, kept in (("none", "0"), ("first", "1"), ("second", "1")):
+        variables = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+        variables |= {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": kept, "XDG_CACHE_HOME": str(tmp_path)}
+        options = ["--evaluation-episodes", "1", "--out", str(tmp_path / name)]
+        command = [sys.executable, "-m", "delayrl", *words.split(), *options]
+        subprocess.run(command, env=variables, stdout=subprocess.DEVNULL, check=True)
+        networks.append((tmp_path / name / "checkpoints" / f"{300:012d}" / "agent.safetensors").read_bytes())
+    assert len(list((tmp_path / "delayrl").rglob("*-cache"))) > 0
+    assert networks[0] == networks[1] == networks[2]
