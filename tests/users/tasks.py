@@ -68,6 +68,7 @@ LATER = "import sys; assert not {'jax', 'mujoco'} & set(sys.modules), 'imported 
 ran(f"import delayrl; import gymnasium; {LATER}; env = gymnasium.make('delayrl/Ant-v4'); {MADE}")
 ran(f"import gymnasium; import delayrl; {LATER}; env = gymnasium.make('delayrl/Ant-v4'); {MADE}")
 ran(f"import gymnasium; env = gymnasium.make('delayrl:delayrl/Ant-v4'); {MADE}")
+typed("delayrl measure delayrl:delayrl/Walk-v0 --episodes 2", "observation delay")
 
 point(3, "the errors of one's own code")
 Path("unplugged.py").write_text("import driver_of_the_arm\n")
