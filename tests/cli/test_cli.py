@@ -101,6 +101,11 @@ def test_watch_ends_quietly(run: Path, tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_a_run_folder_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    line = "there is no run folder runs/nowhere/seed0; `delayrl runs` lists the runs below runs/"
+    assert line in refused(capsys, "train", "runs/nowhere/seed0", "--steps", "300")
+
+
 def test_watch_compares_on_one_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = tmp_path / "other"
     shutil.copytree(run, other)

@@ -12,6 +12,7 @@ from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.wrappers import NormalizeObservation, TimeLimit
 
 import delayrl
+import own_tasks
 from delayrl.envs import delay_of
 from delayrl.envs.task import Part, Task, as_task, stored_task
 from delayrl.errors import DelayRLError
@@ -177,9 +178,10 @@ def test_another_limit_than_the_registered_one() -> None:
 # ------------------------------------------------------------------------------------------------ errors
 
 
-def test_an_instance_is_refused() -> None:
+def test_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_tasks, "READY", Arm(), raising=False)
     words = r"an instance of Arm\): give its class, a function that makes it, or its id"
-    for env in (Arm(), TimeLimit(Arm(), 3), gym.vector.SyncVectorEnv([Arm])):
+    for env in (Arm(), TimeLimit(Arm(), 3), gym.vector.SyncVectorEnv([Arm]), "own_tasks:READY"):
         with pytest.raises(DelayRLError, match="this is one"):
             delayrl.make(env)  # type: ignore[arg-type]
     with pytest.raises(DelayRLError, match=words):
@@ -194,6 +196,7 @@ def test_an_instance_is_refused() -> None:
     ("text", "words"),
     [
         ("Nowhere-v3", "unknown task 'Nowhere-v3'"),
+        ("my_arm", "`delayrl tasks` lists tasks to choose from, and one of your own is MODULE:NAME$"),
         ("my_arm:Broken(how=1)", "cannot be made here: ValueError: the serial port is closed$"),
         ('my_arm:Broken(how="id")', r"'my_arm:Broken\(how=\"id\"\)' cannot be made here: NameNotFound: .*Nowhere"),
         ("my_arm:Broken", "cannot be made here: TypeError: .*missing 1 required positional argument: 'how'"),

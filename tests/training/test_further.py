@@ -74,6 +74,8 @@ def test_what_cannot_go_on_is_left_as_it_is(tmp_path: Path) -> None:
         delayrl.go_on(part.path, 300)
     with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder"):
         delayrl.go_on(tmp_path / "nowhere", 300)
+    with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder"):
+        train("bpql", tmp_path / "new", start_from=tmp_path / "nowhere")
     train("bpql", tmp_path / "two" / "seed0", steps=200)
     train("bpql", tmp_path / "two" / "seed1", steps=200, seed=1, delay=2)
     with pytest.raises(delayrl.DelayRLError, match="seed1 has another delay than the other seeds; train it alone"):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import delayrl
+from delayrl.cli.compare import differences
 from delayrl.cli.main import main
 from delayrl.play.evaluation import RANDOM_ACTIONS, TRAINING, reset_seed
 from delayrl.play.run import Run
@@ -133,3 +134,9 @@ def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err == "delayrl: compare takes two to 8 runs; got 1\n"
     main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "same.png")])
     assert "all options  the same  the same" in capsys.readouterr().out
+
+
+def test_compare_says_what_a_run_began_from() -> None:
+    origin = {"agent": "bpql", "env": "Walk", "delay": 2, "seed": 0, "step": 400, "networks": 5 * "d2e63b2c5ccd"}
+    (row,) = differences([{"agent": "bpql"}, {"agent": "bpql", "origin": {"from": origin}}])
+    assert row == ["from", "-", "agent bpql, env Walk, delay 2, seed 0, step 400, networks d2e63b2c5ccd"]

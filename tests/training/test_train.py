@@ -270,10 +270,10 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"replay_capacity": 5}, "at least"),
         (
             {"steps": 99},
-            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_st",
+            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_steps$",
         ),
         ({"steps": 100, "update_every": 101, "clone_every": 102}, "the first update is at step 101"),
-        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after, or preset"),
+        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after$"),
         ({"track": "paper"}, "tensorboard or wandb"),
     ],
 )
@@ -292,6 +292,8 @@ def test_a_run_learns_something(steps: int, every: int, fits: bool) -> None:
     with nullcontext() if fits else pytest.raises(delayrl.DelayRLError, match="nothing would be learned"):
         check_fit(setup, task)
     check_fit(resolve("random", "Reacher-v5", 3, "small", "corrected", {"steps": steps}), task)  # never learns
+    with pytest.raises(delayrl.DelayRLError, match=r"step 5,000, .* fewer random_steps, or preset small$"):
+        check_fit(resolve("a-sac", "Reacher-v5", 3, "paper", "corrected", {"steps": 1500}), task)
 
 
 def test_unknown_agent() -> None:

@@ -26,6 +26,8 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     if words[0] not in AGENTS and Path(words[0]).is_dir():
         _add_options_of_a_run(parser, words[0])
         return
+    if "/" in words[0]:
+        raise DelayRLError(f"there is no run folder {words[0]}; `delayrl runs` lists the runs below runs/")
     agent = find_agent(words[0])
     parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary
     parser.allow_abbrev = False

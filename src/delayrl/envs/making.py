@@ -13,6 +13,7 @@ from delayrl.envs import paper
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.single import check_length
+from delayrl.wrappers.single import check_limit as check_limit
 from delayrl.wrappers.single import name_of as name_of
 from delayrl.wrappers.single import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill

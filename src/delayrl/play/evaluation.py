@@ -16,7 +16,7 @@ from delayrl.agents.base import Agent, State
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
-from delayrl.envs import delay_of, make
+from delayrl.envs.making import check_limit, delay_of, make
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, load, task_of, trained_delay
@@ -51,6 +51,7 @@ class Evaluator:
         served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
         self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        check_limit(self._envs[0][0], str(as_task(env)))
         self._act = _compiled_act(agent)
 
     def __call__(

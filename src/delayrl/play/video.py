@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from delayrl.delays import DelayLike
 from delayrl.envs import make
-from delayrl.envs.making import name_of
+from delayrl.envs.making import check_limit, name_of
 from delayrl.envs.task import TaskLike
 from delayrl.errors import DelayRLError, first_line
 from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
@@ -92,6 +92,7 @@ def watch(
             served = servable(task, trained_delay(path) if delay is None else delay, policy.spec)
             played = make(task, served, render_mode="rgb_array")
             stack.callback(close, played)
+            check_limit(played, str(task))
             rate = float(played.metadata.get("render_fps") or 30)
             stride = max(1, round(rate / FASTEST[out.suffix]))
             titles.append(f"{config['agent']}, delay {served.label()}")

@@ -69,7 +69,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
 
 def source_of(run: RunFolder) -> tuple[dict[str, Any], Checkpoint]:
     """Return what the configuration says of a run whose networks another one begins with, and its newest checkpoint."""
-    checkpoint, config = run.latest(), run.config
+    config, checkpoint = run.config, run.latest()
     names = ("agent", "env", "delay", "seed", "configuration")
     described = {name: config[name] for name in names if name in config}
     return described | {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}, checkpoint

@@ -31,7 +31,7 @@ from delayrl.training.resume import source_of, start
 from delayrl.training.seeds import run_folders, seed_numbers
 from delayrl.training.state import Group
 from delayrl.wrappers import Delayed
-from delayrl.wrappers.single import limit_of
+from delayrl.wrappers.single import check_limit
 
 
 @overload
@@ -173,14 +173,13 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
     if first > schedule.steps:
         start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
+        start += "" if setup.condition.preset == "small" else ", or preset small"
         raise DelayRLError(
             f"nothing would be learned: the first update is at step {first:,}, and the run ends at step "
-            f"{schedule.steps:,}; give more steps, {start}, or preset small"
+            f"{schedule.steps:,}; give more steps, {start}"
         )
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
-    if limit_of(env) is None:
-        hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'"
-        raise DelayRLError(f"{setup.task} has no time limit, so evaluation may never end; {hint}")
+    check_limit(env, str(setup.task))
     return template(agent, spec)
