@@ -101,6 +101,9 @@ plain, scaled = delayrl.make(make, 1), delayrl.make(make, 1, wrappers=["workshop
 holds("the wrapper is there", np.allclose(3 * plain.reset(seed=0)[0], scaled.reset(seed=0)[0]))
 refused("delayrl train random --env arm:make --wrapper workshop:Scale", "did you mean Scaled?")
 refused("delayrl train random --env arm:make --wrapper Scaled", "module:Class")
+env = delayrl.make(make, 4, normalise=True)
+shown = [env.reset(seed=seed)[0] for seed in range(20)]
+holds("delayrl.make(make, 4, normalise=True)", 0.5 < np.std(shown) < 2 and abs(np.mean(shown)) < 1, shown)
 for outer in (NormalizeObservation, lambda env: TimeLimit(env, 20)):
     env = delayrl.AugmentedObservation(outer(delayrl.Delayed(gymnasium.make("Pendulum-v1"), 3)))
     vector, _ = env.reset(seed=0)
