@@ -1,4 +1,4 @@
-.PHONY: sync check test test-all mutants docs bench
+.PHONY: sync check test test-all coverage mutants docs bench
 
 sync:      ## install the package and everything for development
 	pip install -e '.[dev]'
@@ -13,6 +13,9 @@ test:      ## at least one test of everything, in minutes
 
 test-all:  ## all tests but those that train for minutes (pytest -m slow)
 	pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow'
+
+coverage:  ## test-all, and which lines it does not run
+	pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow' --cov --cov-report=term
 
 mutants:   ## small mistakes in the code that the tests must notice; MUTANTS='--only agents-sac' chooses
 	python benchmarks/mutants/run.py $(MUTANTS)

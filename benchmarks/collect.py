@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 
 from delayrl.play.evaluation import evaluate, sweep
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 
 KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
 
@@ -19,10 +19,10 @@ def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = 
     lines = []
     for number, path in enumerate(runs):
         run = Run(path)
-        metrics = run.read("metrics")
+        metrics = run.metrics()
         speed = metrics[-1]["steps_per_second"] if metrics else None
         lines.append({"run": number, "config": run.config, "steps_per_second": speed})
-        lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.read("rows")]
+        lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.rows()]
         if episodes:
             lines.append({"run": number, "evaluation": evaluate(path, episodes)})
         if episodes and every_delay:

@@ -12,7 +12,7 @@ from collect import collect
 
 import delayrl
 from delayrl.agents.registry import AGENTS
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 SMALL_NETWORKS = {"hidden": [64, 64], "batch_size": 64}
 TASKS: dict[str, dict[str, Any]] = {
@@ -44,7 +44,9 @@ def main() -> None:
         out = Path("runs/small") / given.task / agent
         delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
         print(f"{agent}: done", flush=True)
-    complete = [path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if Run(path).latest().complete]
+    complete = [
+        path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if RunFolder(path).latest().complete
+    ]
     collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", complete, 20, every_delay=kind != given.task)
 
 

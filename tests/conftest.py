@@ -48,7 +48,7 @@ from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.delays import Delay  # noqa: E402
 from delayrl.envs import make  # noqa: E402
-from delayrl.run.folder import Run  # noqa: E402
+from delayrl.play.run import Run  # noqa: E402
 from delayrl.training.actor import Actor  # noqa: E402
 from delayrl.training.learner import Learner, Program, Stored  # noqa: E402
 from short_runs import train  # noqa: E402

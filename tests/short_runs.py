@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import delayrl
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
+from delayrl.run.checkpoint import Checkpoint
+from delayrl.run.folder import RunFolder, RunLike
 from delayrl.training.loop import Loop
 
 TINY = {
@@ -58,8 +60,12 @@ def killed_and_resumed(agent: str, out: Path, monkeypatch: pytest.MonkeyPatch, *
     return train(agent, out, **values)
 
 
-def arrays(run: Run) -> dict[str, np.ndarray]:
-    return run.latest().arrays("agent")
+def newest(run: RunLike) -> Checkpoint:
+    return RunFolder(Path(run)).latest()
+
+
+def arrays(run: RunLike) -> dict[str, np.ndarray]:
+    return newest(run).arrays("agent")
 
 
 def declare(folder: Path, group: str, **points: str) -> None:

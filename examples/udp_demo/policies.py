@@ -18,8 +18,8 @@ class RunPolicy:
 
     def __init__(self, path: Path) -> None:
         import delayrl
+        from delayrl import Run
         from delayrl.envs import make
-        from delayrl.run.folder import Run
         from delayrl.wrappers.single import seconds_of
 
         self._policy = delayrl.load(path)

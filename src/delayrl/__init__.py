@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from delayrl.play.evaluation import evaluate as evaluate
     from delayrl.play.policy import Policy as Policy
     from delayrl.play.policy import load as load
-    from delayrl.run.folder import Run as Run
-    from delayrl.run.folder import runs as runs
+    from delayrl.play.run import Run as Run
+    from delayrl.play.run import runs as runs
     from delayrl.training.further import go_on as go_on
     from delayrl.training.train import train as train
     from delayrl.wrappers import AugmentedObservation as AugmentedObservation
@@ -40,11 +40,11 @@ _HOME = {
     "DelayedVector": "wrappers",
     "as_delay": "delays",
     "Policy": "play.policy",
-    "Run": "run.folder",
+    "Run": "play.run",
     "evaluate": "play.evaluation",
     "load": "play.policy",
     "make": "envs",
-    "runs": "run.folder",
+    "runs": "play.run",
     "go_on": "training.further",
     "train": "training.train",
 }

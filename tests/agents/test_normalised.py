@@ -92,12 +92,12 @@ def test_a_run_keeps_its_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     """Killed and resumed it is the same run; loaded, its policy has them."""
     whole = train("bpql", tmp_path / "whole", observation_norm="running")
     cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, observation_norm="running")
-    assert cut.read("rows") == whole.read("rows")
+    assert cut.rows() == whole.rows()
     for name, array in arrays(cut).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
     policy = delayrl.load(whole.path)
     assert isinstance(policy.agent, NormalisedObservations)
     assert policy.state.moments.number == 201 * 8  # updates of the run, windows of a batch
-    assert train("bpql", tmp_path / "plain").read("rows") != whole.read("rows")
+    assert train("bpql", tmp_path / "plain").rows() != whole.rows()
     with pytest.raises(delayrl.DelayRLError, match="observation_norm must be one of none, running; got 'batch'"):
         train("bpql", tmp_path / "bad", observation_norm="batch")

@@ -81,6 +81,7 @@ PAPER = {
         "clone_updates": 1000,
         "direction": "reverse",
         "behaviour": "lower-q",
+        "tokens": 0,
         "at_age_0": "reference",
     },
     "ad-sac": VDPO_SAC | {"auxiliary_delay": 0, "behaviour": "lower-q", "evaluation": "mode"},

@@ -96,22 +96,22 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, del
     """Travel times come back with the episode: the same rows and parameters as uninterrupted."""
     whole = train("a-sac", tmp_path / "whole", delay=delay)
     assert whole.config["delay"] == delay
-    assert {row["delay"] for row in whole.read("rows")} == {delay}
+    assert {row["delay"] for row in whole.rows()} == {delay}
 
     cut = killed_and_resumed("a-sac", tmp_path / "cut", monkeypatch, delay=delay)
-    assert cut.read("rows") == whole.read("rows")
+    assert cut.rows() == whole.rows()
     for name, array in arrays(cut).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
 
 
 def test_rows_name_the_physics(tmp_path: Path) -> None:
     run = train("random", tmp_path / "pusher", env="delayrl/Pusher-v4", delay="paper-stochastic-5")
-    row = run.read("rows")[0]
+    row = run.rows()[0]
     assert row["delay"] == run.config["delay"] == "paper-stochastic-5"
     assert row["mujoco"] == run.config["versions"]["mujoco"]
     assert row["gymnasium"] == run.config["versions"]["gymnasium"]
     assert len(row["physics"]) == 16
-    other = train("random", tmp_path / "probe", env="delayrl/Counter-v0", delay=1).read("rows")[0]
+    other = train("random", tmp_path / "probe", env="delayrl/Counter-v0", delay=1).rows()[0]
     assert other["physics"] is other["mujoco"] is None
 
 
@@ -122,7 +122,7 @@ def test_a_recorded_delay_needs_its_file_only_once(tmp_path: Path) -> None:
     trace.unlink()
     assert delayrl.load(run.path).spec.delay == 3
     assert np.isfinite(evaluate(run.path, 2)["mean_return"])
-    assert len(run.read("rows")[0]["delay"]) < 40
+    assert len(run.rows()[0]["delay"]) < 40
 
 
 @pytest.mark.parametrize("agent", ["vdpo", "dida"])
@@ -130,7 +130,7 @@ def test_train_and_evaluate_a_delay_of_each_episode(agent: str, tmp_path: Path) 
     """Each start state under the delay of its seed: the return is that under this delay alone."""
     run = train(agent, tmp_path / "run", delay="action=episode:1:3")
     assert run.config["delay"] == "0+action=episode:1:3"
-    assert all(np.isfinite(row["return"]) for row in run.read("rows"))
+    assert all(np.isfinite(row["return"]) for row in run.rows())
     returns = evaluate(run.path, 8)["returns"]
     alone = [evaluate(run.path, 8, f"action={lag}")["returns"] for lag in (1, 2, 3)]
     lags = {column.index(own) for own, *column in zip(returns, *alone, strict=True)}

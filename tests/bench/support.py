@@ -9,7 +9,7 @@ import numpy as np
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid
-from delayrl.run.folder import Run
+from short_runs import newest
 
 SAC = """
 preset = "small"
@@ -63,7 +63,7 @@ def assert_same_results(file: Path, runs: Path, expected: Path) -> None:
             rows = [json.loads(line) for line in text.splitlines()]
             episodes = [(row["step"], row["policy"], row["episode"]) for row in rows]
             assert len(set(episodes)) == len(episodes) == cell.condition.steps // 30
-            ours, others = (Run(run).latest().arrays("agent") for run in (mine, theirs))
+            ours, others = (newest(run).arrays("agent") for run in (mine, theirs))
             for name, array in ours.items():
                 np.testing.assert_array_equal(array, others[name])
 

@@ -18,7 +18,7 @@ from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
 from delayrl.run import provenance
 from delayrl.run.cell import Cell
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 MIXED = """
@@ -85,8 +85,8 @@ def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> N
     """A table keeps unknown columns, constant or not, and the versions of every start."""
     grid, runs = finished
     cell = replace(grid.cells[0], id="0123")
-    run = Run(runs / cell.folder / "seed0")
-    source = Run(runs / grid.cells[0].folder / "seed0")
+    run = RunFolder(runs / cell.folder / "seed0")
+    source = RunFolder(runs / grid.cells[0].folder / "seed0")
     run.create({k: v for k, v in source.config.items() if k != "format"})
     rows = source.read("rows")
     for i, row in enumerate(rows):
@@ -161,7 +161,7 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
 def test_an_episode_twice(finished, tmp_path: Path) -> None:
     grid, runs = finished
     cell = replace(grid.cells[0], id="4567")
-    run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
+    run, source = (RunFolder(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
     run.create({k: v for k, v in source.config.items() if k != "format"})
     run.append("rows", source.read("rows")[:2] + source.read("rows")[:1])
     with pytest.raises(delayrl.DelayRLError, match="holds an episode twice"):
@@ -174,7 +174,7 @@ def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
     """Reading and collecting fail with one line, and no table is written."""
     grid, runs = finished
     cell = replace(grid.cells[0], id="5678")
-    run, source = (Run(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
+    run, source = (RunFolder(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
     run.remove()
     run.create({k: v for k, v in source.config.items() if k != "format"})
     run.append("rows", source.read("rows"))

@@ -15,7 +15,7 @@ from delayrl.cli.console import Parser
 from delayrl.cli.main import COMMANDS, main
 from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
-from delayrl.run.folder import Run
+from short_runs import newest
 
 SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
 SMALL += ["--batch-size", "8", "--hidden", "8", "8", "--replay-capacity", "250"]
@@ -108,6 +108,11 @@ def test_watch_ends_quietly(run: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith("delayrl: cannot write ")
     assert done.stderr.count("\n") == 1
+
+
+def test_a_run_folder_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    line = "there is no run folder runs/nowhere/seed0; `delayrl runs` lists the runs below runs/"
+    assert line in refused(capsys, "train", "runs/nowhere/seed0", "--steps", "300")
 
 
 def test_watch_compares_on_one_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -260,7 +265,7 @@ def test_stopped_run_goes_on(tmp_path: Path) -> None:
     assert process.returncode == 2
     assert "goes on from there" in err
     assert "Traceback" not in err
-    stopped = Run(tmp_path / "run").latest().step
+    stopped = newest(tmp_path / "run").step
     assert stopped > 0
     assert f"stopped at step {stopped:,}" in err
 

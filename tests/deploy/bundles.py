@@ -17,7 +17,7 @@ from delayrl.deploy.files import write_files
 from delayrl.play.policy import Policy
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.configuration import values_of
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
@@ -59,7 +59,7 @@ def bundle_of(path: Path, policy: Policy, **metadata: Any) -> Path:
 def run_of(path: Path, name: str = "vdpo", env: str = "Reacher-v5", delay: int = 3, sizes: tuple[int, int] = (OBS, 2)):
     """A complete run folder with a checkpoint at step 240, as the loop would leave it."""
     agent = AGENTS[name] if name in AGENTS else REGISTRY[name].presets["small"].agent
-    run = Run(path)
+    run = RunFolder(path)
     described = {"agent": name, "preset": "small", "env": env, "delay": delay, "protocol": "corrected"}
     described |= {"privileged": agent.privileged, "hyperparameters": values_of(agent), "schedule": {}}
     run.create(described | {"seed": 3, "versions": {"numpy": "2"}})

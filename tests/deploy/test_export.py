@@ -15,7 +15,8 @@ from delayrl.deploy import Controller, export_run, load_bundle
 from delayrl.deploy.latency import ages_of, latency
 from delayrl.envs import tasks
 from delayrl.errors import DelayRLError
-from delayrl.run.folder import Checkpoint, Run
+from delayrl.run.checkpoint import Checkpoint
+from delayrl.run.folder import RunFolder
 
 
 @pytest.fixture(scope="module")
@@ -141,14 +142,14 @@ def test_odd_rows_are_one_line(rows: bytes, tmp_path: Path, capsys: pytest.Captu
 def test_training_may_go_on_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If a checkpoint appears while the newest is read, step and weights still belong to the same one."""
     run = run_of(tmp_path / "run", "bpql")
-    latest = Run.latest
+    latest = RunFolder.latest
 
-    def then_another(self: Run) -> Checkpoint:
+    def then_another(self: RunFolder) -> Checkpoint:
         newest = latest(self)
         run.save(newest.step + 120, newest.arrays("agent"), None, {}, complete=True)
         return newest
 
-    monkeypatch.setattr(Run, "latest", then_another)
+    monkeypatch.setattr(RunFolder, "latest", then_another)
     assert export_run(run.path, tmp_path / "bundle")["step"] == 240
 
 

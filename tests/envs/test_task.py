@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import NormalizeObservation, TimeLimit
 
 import delayrl
+import own_tasks
 from delayrl.envs import delay_of
 from delayrl.envs.task import Part, Task, as_task, stored_task
 from delayrl.errors import DelayRLError
@@ -130,6 +131,22 @@ def test_wrappers_and_flat_observations() -> None:
     assert ends == [False] * 19 + [True]
 
 
+def test_normalised_observations() -> None:
+    """As Gymnasium's wrapper between task and delay, outside of flattening; its moments can be read and stopped."""
+    ours = delayrl.make(Arm, 2, wrappers=[LIMIT, Camera], flatten=True, normalise=True)
+    theirs = delayrl.Delayed(NormalizeObservation(as_task(Arm, {}, [LIMIT, Camera], True).make()), 2)
+    shown = []
+    for env in (ours, theirs):
+        env.action_space.seed(0)
+        shown.append([env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(9))])
+    np.testing.assert_array_equal(*shown)
+    moments = ours.get_wrapper_attr("obs_rms")
+    assert (moments.mean.shape, round(moments.count)) == ((4,), 10)
+    ours.set_wrapper_attr("update_running_mean", False)
+    ours.step(ours.action_space.sample())
+    assert round(moments.count) == 10
+
+
 def test_the_limit_of_an_environment_without_a_spec() -> None:
     """A late termination waits no longer than the time limit, and no delay is longer than an episode."""
 
@@ -161,9 +178,10 @@ def test_another_limit_than_the_registered_one() -> None:
 # ------------------------------------------------------------------------------------------------ errors
 
 
-def test_an_instance_is_refused() -> None:
+def test_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_tasks, "READY", Arm(), raising=False)
     words = r"an instance of Arm\): give its class, a function that makes it, or its id"
-    for env in (Arm(), TimeLimit(Arm(), 3), gym.vector.SyncVectorEnv([Arm])):
+    for env in (Arm(), TimeLimit(Arm(), 3), gym.vector.SyncVectorEnv([Arm]), "own_tasks:READY"):
         with pytest.raises(DelayRLError, match="this is one"):
             delayrl.make(env)  # type: ignore[arg-type]
     with pytest.raises(DelayRLError, match=words):
@@ -178,6 +196,7 @@ def test_an_instance_is_refused() -> None:
     ("text", "words"),
     [
         ("Nowhere-v3", "unknown task 'Nowhere-v3'"),
+        ("my_arm", "`delayrl tasks` lists tasks to choose from, and one of your own is MODULE:NAME$"),
         ("my_arm:Broken(how=1)", "cannot be made here: ValueError: the serial port is closed$"),
         ('my_arm:Broken(how="id")', r"'my_arm:Broken\(how=\"id\"\)' cannot be made here: NameNotFound: .*Nowhere"),
         ("my_arm:Broken", "cannot be made here: TypeError: .*missing 1 required positional argument: 'how'"),

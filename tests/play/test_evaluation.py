@@ -12,7 +12,7 @@ import delayrl
 from delayrl.core.types import Seen, Spec
 from delayrl.envs import make
 from delayrl.play.evaluation import EVALUATION, HELD_OUT, RANDOM_ACTIONS, TRAINING, Evaluator, evaluate, reset_seed
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 
 
 def test_any_shorter_delay(vdpo: Run) -> None:

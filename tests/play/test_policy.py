@@ -8,7 +8,7 @@ import pytest
 
 import delayrl
 from delayrl.play.evaluation import evaluate
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 from short_runs import train
 
 

@@ -15,7 +15,7 @@ from delayrl.report.rows import read_rows
 from delayrl.report.summary import Summary, summarise
 from delayrl.run.condition import overrides_of, resolve
 from delayrl.run.cost import Cost
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 COST = Cost(12_345, {"actor": 0.5, "critic": 1.0, "temperature": 0.5}, (128,), 3.2e9)
 
@@ -27,7 +27,7 @@ def made(
     """A run folder whose evaluations are all `value`, one every 100 steps; its rows."""
     setup = resolve(agent, env, delay, "small", "corrected", {"steps": 300} | values)
     names: dict[str, Any] = {} if older else {"configuration": setup.configuration}
-    run = Run(folder)
+    run = RunFolder(folder)
     run.create(setup.config | names | {"seed": seed, "cost": COST.json})
     columns = setup.condition.columns | {"privileged": False, "seed": seed, "policy": "agent", "episode": 0} | names
     steps = range(100, min(setup.schedule.steps, until) + 1, 100)
@@ -74,7 +74,7 @@ def test_a_run_ends_where_its_configuration_says(tmp_path: Path) -> None:
 
 def test_without_configurations_the_hash_tells_them_apart(tmp_path: Path) -> None:
     rows = made(tmp_path / "a", 1.0), made(tmp_path / "b", 2.0, discount=0.9)
-    hashes = [Run(path.parent).config["configuration"][:8] for path in rows]
+    hashes = [RunFolder(path.parent).config["configuration"][:8] for path in rows]
     expected = {f"bpql configuration={name}": [value] for name, value in zip(hashes, (1.0, 2.0), strict=True)}
     assert finals(*rows, configs=False) == expected
     assert finals(rows[0], configs=False) == {"bpql": [1.0]}

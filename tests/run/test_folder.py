@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 
 from delayrl.errors import DelayRLError
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 WEIGHTS = {"w": np.ones(3, np.float32)}
 LOOP = {"rows": np.int32(1)}
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
-    run = Run(tmp_path / "run")
+def run(tmp_path: Path) -> RunFolder:
+    run = RunFolder(tmp_path / "run")
     run.create({"agent": "sac", "preset": "small", "env": "E", "delay": 0, "hyperparameters": {}, "schedule": {}})
     run.save(100, WEIGHTS, LOOP, {})
     return run
 
 
-def test_a_checkpoint_of_the_same_step_is_replaced_only_when_complete(run: Run, monkeypatch) -> None:
+def test_a_checkpoint_of_the_same_step_is_replaced_only_when_complete(run: RunFolder, monkeypatch) -> None:
     """A run that is stopped right after an evaluation saves its step twice."""
     run.save(100, {"w": np.zeros(3, np.float32)}, LOOP, {})
     assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
@@ -38,7 +38,7 @@ def test_a_checkpoint_of_the_same_step_is_replaced_only_when_complete(run: Run, 
     assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
 
 
-def test_drafts_that_a_killed_process_left_are_deleted(run: Run) -> None:
+def test_drafts_that_a_killed_process_left_are_deleted(run: RunFolder) -> None:
     home = run.path / "checkpoints"
     for name in (".draft", ".000000000150.draft"):  # of version 0.1, and of today
         (home / name).mkdir()
@@ -58,7 +58,7 @@ def test_drafts_that_a_killed_process_left_are_deleted(run: Run) -> None:
         ({"pieces": 3}, "its manifest is damaged"),
     ],
 )
-def test_a_damaged_manifest_is_one_line(damage: dict, words: str, run: Run) -> None:
+def test_a_damaged_manifest_is_one_line(damage: dict, words: str, run: RunFolder) -> None:
     run.save(200, WEIGHTS, LOOP, {})
     file = run.path / "checkpoints" / "000000000200" / "manifest.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | damage))
@@ -69,7 +69,7 @@ def test_a_damaged_manifest_is_one_line(damage: dict, words: str, run: Run) -> N
     assert run.latest().step == 100
 
 
-def test_a_copy_of_a_checkpoint_is_left_out(run: Run) -> None:
+def test_a_copy_of_a_checkpoint_is_left_out(run: RunFolder) -> None:
     home = run.path / "checkpoints"
     shutil.copytree(home / "000000000100", home / "000000000100.bak")
     assert run.latest().step == 100
@@ -77,7 +77,7 @@ def test_a_copy_of_a_checkpoint_is_left_out(run: Run) -> None:
 
 
 @pytest.mark.parametrize("name", ["agent", "delay", "schedule"])
-def test_a_damaged_configuration_is_one_line(name: str, run: Run) -> None:
+def test_a_damaged_configuration_is_one_line(name: str, run: RunFolder) -> None:
     config = run.config
     assert "protocol" not in config  # none is needed to open a run
     (run.path / "config.json").write_text(json.dumps({key: value for key, value in config.items() if key != name}))

@@ -8,7 +8,8 @@ import pytest
 
 import delayrl
 from delayrl.deploy import load_bundle
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
+from short_runs import newest
 
 DATA = Path(__file__).parents[1] / "data"
 OPTIONS = {
@@ -37,7 +38,7 @@ def stopped(tmp_path: Path) -> Path:
 
 def test_a_run_is_loaded(stopped: Path) -> None:
     """Its optimiser states have other names in the file."""
-    arrays = Run(stopped).latest().arrays("agent")
+    arrays = newest(stopped).arrays("agent")
     assert {"belief_opt_state.0.count", "reference.actor_opt_state.0.count"} <= arrays.keys()
     assert not [name for name in arrays if "memory" in name]
     action = delayrl.load(stopped).act(np.zeros(4), {"age": 2, "actions": np.zeros((3, 1))})
@@ -46,12 +47,12 @@ def test_a_run_is_loaded(stopped: Path) -> None:
 
 @pytest.mark.thorough
 def test_a_run_is_resumed(stopped: Path) -> None:
-    before = Run(stopped).read("rows")
+    before = Run(stopped).rows()
     run = delayrl.train("vdpo", "InvertedPendulum-v5", out=stopped, progress=False, **OPTIONS)
-    assert run.latest().complete
-    assert run.latest().step == 480
-    assert run.read("rows")[: len(before)] == before
-    assert {row["step"] for row in run.read("rows")} == {160, 320, 480}
+    assert newest(run).complete
+    assert newest(run).step == 480
+    assert run.rows()[: len(before)] == before
+    assert {row["step"] for row in run.rows()} == {160, 320, 480}
 
 
 def test_a_bundle_is_loaded() -> None:

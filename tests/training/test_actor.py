@@ -11,10 +11,9 @@ from delayrl.core.protocol import Protocol
 from delayrl.delays import as_delay
 from delayrl.envs import make
 from delayrl.play.evaluation import TRAINING, reset_seed
-from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.loop import hidden_steps
-from short_runs import train
+from short_runs import newest, train
 
 
 @pytest.mark.parametrize("what", ["reward", "observation"])
@@ -36,14 +35,14 @@ def test_nan_from_the_environment(what: str, tmp_path: Path, monkeypatch) -> Non
     with pytest.raises(delayrl.DelayRLError, match=f"{what} that is not finite"):
         train("bpql", tmp_path / "run")
     monkeypatch.setattr(ReacherEnv, "step", step)
-    assert Run(tmp_path / "run").latest().step >= 100
-    assert train("bpql", tmp_path / "run").latest().step == 300
+    assert newest(tmp_path / "run").step >= 100
+    assert newest(train("bpql", tmp_path / "run")).step == 300
 
 
 def test_official_protocol(tmp_path: Path) -> None:
     """One start state for all episodes, time limits as terminations, a random first action: stated in every row."""
     run = train("a-sac", tmp_path / "run", protocol="official", steps=150)
-    rows = run.read("rows")
+    rows = run.rows()
     assert {row["reset_seed"] for row in rows} == {0}
     assert {row["protocol"] for row in rows} == {"official"}
     assert len({row["return"] for row in rows if row["step"] == 100}) == 2  # the first actions differ

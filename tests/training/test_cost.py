@@ -14,8 +14,8 @@ from delayrl.agents.random import Random
 from delayrl.agents.sac import BPQL, SAC
 from delayrl.core.types import Spec
 from delayrl.core.views import input_size
+from delayrl.play.run import Run
 from delayrl.run.cost import Cost
-from delayrl.run.folder import Run
 from delayrl.training.cost import cost_of, update_counts
 from delayrl.training.products import follow, matmul_flops
 from short_runs import arrays
@@ -117,4 +117,4 @@ def test_of_many_updates_some_are_looked_at(period: int) -> None:
 
 def test_a_run_folder_keeps_its_cost(vdpo: Run) -> None:
     assert vdpo.config["cost"]["batches"] == [8, 8]
-    assert vdpo.config["configuration"] == vdpo.read("rows")[0]["configuration"]
+    assert vdpo.config["configuration"] == vdpo.rows()[0]["configuration"]

@@ -9,13 +9,13 @@ import pytest
 import delayrl
 from conftest import quick
 from delayrl.cli.main import main
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 from delayrl.training.resume import part_of
-from short_runs import arrays, train
+from short_runs import arrays, newest, train
 
 
 def without_hash(run: Run) -> list[dict]:
-    return [{name: value for name, value in row.items() if name != "configuration"} for row in run.read("rows")]
+    return [{name: value for name, value in row.items() if name != "configuration"} for row in run.rows()]
 
 
 @pytest.mark.parametrize("agent", quick(["bpql", "vdpo"], "bpql"))
@@ -30,9 +30,9 @@ def test_a_run_that_goes_on_is_the_longer_run(agent: str, tmp_path: Path) -> Non
     for name, array in arrays(run).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
     assert run.config["origin"] == {"lengths": [200, 300]}
-    assert {row["configuration"] for row in run.read("rows")} == {run.config["configuration"]}
+    assert {row["configuration"] for row in run.rows()} == {run.config["configuration"]}
     assert len({run.config["configuration"], whole.config["configuration"], short}) == 3  # a result of its own
-    assert delayrl.go_on(run.path, 400, progress=False).read("rows") == run.read("rows")  # nothing is left to do
+    assert delayrl.go_on(run.path, 400, progress=False).rows() == run.rows()  # nothing is left to do
 
 
 def test_seeds_go_on_together(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_seeds_go_on_together(tmp_path: Path) -> None:
         ]
         (again / "seed0" / name).write_text("".join(rows))
     again_runs = delayrl.go_on(again, 300, progress=False)
-    assert [run.read("rows") for run in again_runs] == [run.read("rows") for run in runs]
+    assert [run.rows() for run in again_runs] == [run.rows() for run in runs]
 
 
 def test_what_cannot_go_on_is_left_as_it_is(tmp_path: Path) -> None:
@@ -67,13 +67,15 @@ def test_what_cannot_go_on_is_left_as_it_is(tmp_path: Path) -> None:
     part = train("bpql", tmp_path / "part", steps=200)
     shutil.rmtree(part.path / "replay")
     assert delayrl.load(part.path)  # what a finished run is for is still there
-    assert train("bpql", part.path, steps=200).read("rows")
+    assert train("bpql", part.path, steps=200).rows()
     with pytest.raises(
         delayrl.DelayRLError, match=r"part has lost a part of its replay .*--from .*part starts a new run"
     ):
         delayrl.go_on(part.path, 300)
     with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder"):
         delayrl.go_on(tmp_path / "nowhere", 300)
+    with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder"):
+        train("bpql", tmp_path / "new", start_from=tmp_path / "nowhere")
     train("bpql", tmp_path / "two" / "seed0", steps=200)
     train("bpql", tmp_path / "two" / "seed1", steps=200, seed=1, delay=2)
     with pytest.raises(delayrl.DelayRLError, match="seed1 has another delay than the other seeds; train it alone"):
@@ -84,7 +86,7 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     run = train("bpql", tmp_path / "run", steps=200)
     main(["train", str(run.path), "--steps", "3e2", "--quiet", "--slim"])
     assert "300 steps" in capsys.readouterr().out
-    assert max(row["step"] for row in run.read("rows")) == 300
+    assert max(row["step"] for row in run.rows()) == 300
     assert not (run.path / "replay").exists()
     with pytest.raises(SystemExit):
         main(["train", str(run.path)])
@@ -103,14 +105,14 @@ def test_networks_of_another_run(tmp_path: Path, capsys: pytest.CaptureFixture[s
         "seed": 0,
         "configuration": old.config["configuration"],
         "step": 200,
-        "networks": old.latest().files["agent.safetensors"],
+        "networks": newest(old).files["agent.safetensors"],
     }
     before, after, fresh = arrays(old), arrays(new), arrays(train("bpql", tmp_path / "fresh", steps=101, delay=5))
     for name in ("critic.0.0.w", "target.1.1.w"):  # two updates later they have moved by two steps of Adam
         assert np.abs(after[name] - before[name]).max() < 1e-2 < np.abs(after[name] - fresh[name]).max()
     assert after["critic_opt_state.0.count"] == 2
     assert new.config["configuration"] != Run(tmp_path / "fresh").config["configuration"]
-    assert len({row["configuration"] for row in new.read("rows")}) == 1
+    assert len({row["configuration"] for row in new.rows()}) == 1
 
 
 def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

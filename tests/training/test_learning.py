@@ -76,4 +76,4 @@ def test_paper_preset_runs(task: str, delay: int, tmp_path: Path) -> None:
     """200 updates of the preset `paper` at its full size."""
     options = {"env": task, "delay": delay, "random_steps": 300, "steps": 500, "evaluate_every": 500, "progress": False}
     run = delayrl.train("vdpo", out=tmp_path / "run", replay_capacity=2000, evaluation_episodes=1, **options)
-    assert all(np.isfinite(row["return"]) for row in run.read("rows"))
+    assert all(np.isfinite(row["return"]) for row in run.rows())

@@ -20,11 +20,11 @@ from delayrl.core.types import Spec
 from delayrl.deploy import export_run, load_bundle
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import evaluate, sweep
+from delayrl.play.run import Run
 from delayrl.play.video import watch
 from delayrl.run.agents import as_agent, find_agent, known_agents
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.condition import overrides_of, resolve
-from delayrl.run.folder import Run
 from own_agents import Shrink
 from own_tasks import Arm, make_arm, write_module
 from short_runs import arrays, declare
@@ -51,7 +51,7 @@ def test_a_run_names_its_agent(tmp_path: Path) -> None:
     run = train(Shrink(width=4), tmp_path / "run")
     assert run.config["agent"] == "own_agents:Shrink"
     assert run.config["hyperparameters"] == {"width": 4, "factor": 0.5, "batch_size": 4}
-    assert {row["agent"] for row in run.read("rows")} == {"own_agents:Shrink"}
+    assert {row["agent"] for row in run.rows()} == {"own_agents:Shrink"}
     begun = flatten_tree(Shrink(width=4).init(Spec(1, 1, 3), jax.random.key(0)))
     assert float(arrays(run)["updates"]) == 4
     for name in begun.keys() - {"updates"}:

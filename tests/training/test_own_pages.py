@@ -14,7 +14,7 @@ import pytest
 import delayrl
 from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 from own_tasks import write_module
 from short_runs import declare
 

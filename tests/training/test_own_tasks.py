@@ -38,7 +38,7 @@ def test_a_run_names_its_task(tmp_path: Path) -> None:
     run = train("random", tmp_path / "run", env=Arm, **values)
     text = f"own_tasks:Arm(gain=0.5) | {LIMIT} | own_tasks:Camera | flatten"
     assert run.config["env"] == text
-    assert {row["env"] for row in run.read("rows")} == {text}
+    assert {row["env"] for row in run.rows()} == {text}
     assert train("random", tmp_path / "run", env=text).path == run.path
     ids = [resolve("bpql", env, 3, "small", "corrected", {}).cell_id([0]) for env in (Arm, "own_tasks:Arm", make_arm)]
     assert ids[0] == ids[1] != ids[2]
@@ -47,6 +47,10 @@ def test_a_run_names_its_task(tmp_path: Path) -> None:
     result = evaluate(run.path, 2)
     assert result["env"] == text
     assert evaluate(run.path, 2, env_kwargs={"gain": 0})["returns"] != result["returns"]
+    run.create(run.config | {"env": "own_tasks:Arm"})
+    with pytest.raises(DelayRLError, match=r"own_tasks:Arm has no time limit.*behind a \| in the task"):
+        evaluate(run, 2)
+    assert evaluate(run, 2, env=text)["returns"] == result["returns"]
 
 
 def test_a_function_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> None:

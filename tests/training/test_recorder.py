@@ -30,9 +30,9 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def started(protocol: str) -> Any:
         setup = resolve("random", "delayrl/Counter-v0", 2, "small", protocol, {"evaluation_episodes": 2})
-        runs = [SimpleNamespace(path=seed, append=lambda kind, new: rows.extend(new)) for seed in SEEDS]
+        folders = [SimpleNamespace(path=seed, append=lambda kind, new: rows.extend(new)) for seed in SEEDS]
         keys, spec = jax.vmap(jax.random.key)(np.array(SEEDS)), Spec(2, 1, 2)
-        group: Any = SimpleNamespace(setup=setup, seeds=SEEDS, runs=runs, keys=keys, spec=spec, apply=map)
+        group: Any = SimpleNamespace(setup=setup, seeds=SEEDS, folders=folders, keys=keys, spec=spec, apply=map)
         made = Recorder(group, STATE, make("delayrl/Counter-v0", as_delay(2)), None)
         made._evaluators = {"agent": lambda *args: given.append(args) or Episodes(RETURNS, LENGTHS)}  # type: ignore
         return made

@@ -15,9 +15,10 @@ from killing import KilledError, moments, options
 import delayrl
 from conftest import quick
 from delayrl.agents.registry import AGENTS
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
+from delayrl.run.folder import RunFolder
 from delayrl.training.actor import Actor
-from short_runs import arrays, train
+from short_runs import arrays, newest, train
 
 KILLED = ("sac", "bpql", "vdpo")
 
@@ -40,8 +41,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory):
 
 def assert_same(agent: str, out: Path, whole: list[Run]) -> None:
     for run, expected in zip(delayrl.train(agent, out=out, **options(agent)), whole, strict=True):
-        assert run.read("rows") == expected.read("rows")
-        mine, theirs = (r.latest().arrays("agent") for r in (run, expected))
+        assert run.rows() == expected.rows()
+        mine, theirs = (newest(r).arrays("agent") for r in (run, expected))
         assert mine.keys() == theirs.keys()
         for name, array in mine.items():
             np.testing.assert_array_equal(array, theirs[name])
@@ -84,7 +85,7 @@ def test_killed_between_the_first_checkpoints_of_a_group(tmp_path: Path, whole) 
     out = tmp_path / "cut"
     first = "seed1/checkpoints/.000000000060.draft"
     assert not die("sac", out, lambda _, what, path: what == "rename" and path.endswith(first))
-    assert [len(Run(out / f"seed{seed}").checkpoints()[0]) for seed in (0, 1)] == [1, 0]
+    assert [len(RunFolder(out / f"seed{seed}").checkpoints()[0]) for seed in (0, 1)] == [1, 0]
     for moment in range(1, 12):
         assert not die("sac", out, lambda number, *_, moment=moment: number == moment)
     assert_same("sac", out, whole("sac")[0])
@@ -134,13 +135,13 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
     with pytest.raises(KilledError):
         train(agent, tmp_path / "cut", protocol=protocol, slim=True)
     monkeypatch.setattr(Actor, "step", step)
-    run = Run(tmp_path / "cut")
+    run = RunFolder(tmp_path / "cut")
     assert run.latest().step == at // 100 * 100
     run.append("rows", [{"step": 299, "policy": "agent", "return": 0.0}])  # made after the checkpoint
     with open(run.path / "rows.jsonl", "a") as file:
         file.write('{"step": 299, "pol')
     resumed = train(agent, tmp_path / "cut", protocol=protocol, slim=True)
-    assert resumed.read("rows") == whole.read("rows")
+    assert resumed.rows() == whole.rows()
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
     assert not (run.path / "replay").exists()
@@ -167,9 +168,9 @@ def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_pat
     monkeypatch.setattr(Actor, "step", interrupted)
     with pytest.raises(delayrl.DelayRLError, match="stopped at step 157"):
         train(agent, tmp_path / "cut", **values)
-    assert len(Run(tmp_path / "cut").latest().arrays("loop")["pending.obs"]) == (157 - 1) % block + 1
+    assert len(newest(tmp_path / "cut").arrays("loop")["pending.obs"]) == (157 - 1) % block + 1
     resumed = train(agent, tmp_path / "cut", **values)
-    assert resumed.read("rows") == whole.read("rows")
+    assert resumed.rows() == whole.rows()
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
 
@@ -189,17 +190,17 @@ def test_broken_checkpoint_falls_back(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(KilledError):
         train("bpql", tmp_path / "run")
     monkeypatch.setattr(Actor, "step", step)
-    run = Run(tmp_path / "run")
-    newest = run.latest().path / "agent.safetensors"
-    newest.write_bytes(newest.read_bytes()[:-100])
+    run = RunFolder(tmp_path / "run")
+    last = run.latest().path / "agent.safetensors"
+    last.write_bytes(last.read_bytes()[:-100])
     good, broken = run.checkpoints()
     assert [c.step for c in good] == [100]
     assert "agent.safetensors is cut or changed" in broken[0]
     backup = tmp_path / "backup"
     shutil.copytree(run.path, backup)
     whole = train("bpql", tmp_path / "whole")
-    assert train("bpql", run.path).read("rows") == whole.read("rows")
-    (Run(backup).latest().path / "manifest.json").write_text("{")
+    assert train("bpql", run.path).rows() == whole.rows()
+    (newest(backup).path / "manifest.json").write_text("{")
     with pytest.raises(delayrl.DelayRLError, match="no good checkpoint"):
         train("bpql", backup)
     with pytest.raises(delayrl.DelayRLError, match="broken"):

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import delayrl
+from delayrl.cli.compare import differences
 from delayrl.cli.main import main
 from delayrl.play.evaluation import RANDOM_ACTIONS, TRAINING, reset_seed
-from delayrl.run.folder import Run
-from short_runs import arrays, killed_and_resumed, train
+from delayrl.play.run import Run
+from short_runs import arrays, killed_and_resumed, newest, train
 
 
 def test_curves_are_those_of_the_rows(vdpo: Run) -> None:
@@ -55,7 +56,7 @@ def test_a_callback_sees_each_evaluation_and_may_stop(tmp_path: Path) -> None:
     seen = []
 
     def stop_at_200(step: int, runs: list[Run]) -> bool:
-        seen.append((step, len(runs[0].rows()), runs[0].latest().step))
+        seen.append((step, len(runs[0].rows()), newest(runs[0]).step))
         return step == 200
 
     run = train("bpql", tmp_path / "run", callback=stop_at_200)
@@ -78,6 +79,15 @@ def test_runs_of_a_folder(tmp_path: Path) -> None:
     assert delayrl.runs(str(tmp_path / "b")) == [made[0]]
     with pytest.raises(delayrl.DelayRLError, match="there is no folder"):
         delayrl.runs(tmp_path / "nowhere")
+
+
+def test_a_run_gives_its_policy(vdpo: Run) -> None:
+    """The same as `load`; and a run is a path, equal to another of the same folder."""
+    obs, info = delayrl.make("Reacher-v5", 3).reset(seed=1)
+    np.testing.assert_array_equal(vdpo.policy().act(obs, info), delayrl.load(vdpo.path).act(obs, info))
+    assert Path(vdpo) == vdpo.path
+    assert {delayrl.Run(str(vdpo.path)), vdpo} == {vdpo}
+    assert repr(vdpo) == f"Run({str(vdpo.path)!r})"
 
 
 def test_evaluate_takes_a_run_its_folder_or_a_policy(vdpo: Run) -> None:
@@ -124,3 +134,9 @@ def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err == "delayrl: compare takes two to 8 runs; got 1\n"
     main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "same.png")])
     assert "all options  the same  the same" in capsys.readouterr().out
+
+
+def test_compare_says_what_a_run_began_from() -> None:
+    origin = {"agent": "bpql", "env": "Walk", "delay": 2, "seed": 0, "step": 400, "networks": 5 * "d2e63b2c5ccd"}
+    (row,) = differences([{"agent": "bpql"}, {"agent": "bpql", "origin": {"from": origin}}])
+    assert row == ["from", "-", "agent bpql, env Walk, delay 2, seed 0, step 400, networks d2e63b2c5ccd"]

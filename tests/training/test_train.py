@@ -12,24 +12,24 @@ import delayrl
 from conftest import quick
 from delayrl.envs import make
 from delayrl.play.evaluation import Evaluator
+from delayrl.play.run import Run
 from delayrl.run.condition import resolve
-from delayrl.run.folder import Run
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Program
 from delayrl.training.train import check_fit
-from short_runs import arrays, train
+from short_runs import arrays, newest, train
 
 
 def test_rows(vdpo: Run) -> None:
     """One for each episode, raw; the reference beside the agent; a start state of its own for each."""
-    rows = vdpo.read("rows")
+    rows = vdpo.rows()
     assert len(rows) == 3 * 2 * 2
     assert {row["policy"] for row in rows} == {"agent", "reference"}
     assert {row["step"] for row in rows} == {100, 200, 300}
     assert len({row["reset_seed"] for row in rows}) == 6
     assert all(row["length"] == 50 and row["return"] < 0 for row in rows)
     assert all(row["privileged"] and row["protocol"] == "corrected" for row in rows)
-    metrics = vdpo.read("metrics")
+    metrics = vdpo.metrics()
     assert metrics == []  # logged every 1000 steps
     assert (vdpo.path / "curve.png").stat().st_size > 5000
     assert set(vdpo.config["versions"]) >= {"jax", "mujoco", "gymnasium", "numpy", "device"}
@@ -37,11 +37,11 @@ def test_rows(vdpo: Run) -> None:
 
 def test_same_seed_same_run(vdpo: Run, tmp_path: Path) -> None:
     again = train("vdpo", tmp_path / "again")
-    assert again.read("rows") == vdpo.read("rows")
+    assert again.rows() == vdpo.rows()
     for name, array in arrays(again).items():
         np.testing.assert_array_equal(array, arrays(vdpo)[name])
     other = train("vdpo", tmp_path / "other", seed=1)
-    assert other.read("rows")[0]["return"] != vdpo.read("rows")[0]["return"]
+    assert other.rows()[0]["return"] != vdpo.rows()[0]["return"]
 
 
 @pytest.mark.parametrize("agent", quick(["bpql", "vdpo"], "bpql"))
@@ -50,7 +50,7 @@ def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
     alone = train(agent, tmp_path / "alone", seeds=2)
     beside = train(agent, tmp_path / "beside", seeds=2, threads=3)
     for one, other in zip(alone, beside, strict=True):
-        assert one.read("rows") == other.read("rows")
+        assert one.rows() == other.rows()
         for name, array in arrays(one).items():
             np.testing.assert_array_equal(array, arrays(other)[name])
     with pytest.raises(delayrl.DelayRLError, match="threads must be at least 1; got 0"):
@@ -107,7 +107,7 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
     monkeypatch.setattr(Program, "act", acting)
     monkeypatch.setattr(Evaluator, "__call__", evaluating)
     run = train("bpql", tmp_path / "run", steps=101, precision=precision)
-    assert len(run.read("rows")) == 4
+    assert len(run.rows()) == 4
     assert len(lowered) > 30
     assert all(words in line for line in lowered)
 
@@ -121,7 +121,7 @@ def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
 def test_a_block_may_begin_before_learning_does(tmp_path: Path) -> None:
     """Its own random steps are there to learn from."""
     run = train("bpql", tmp_path / "run", random_steps=50, updates_per_call=100)
-    assert run.latest().complete
+    assert newest(run).complete
 
 
 @pytest.mark.thorough
@@ -140,7 +140,7 @@ def test_runs_from_before_an_option_go_on(tmp_path: Path) -> None:
     for name in ("updates_per_call", "precision"):
         del stored["schedule"][name]
     (run.path / "config.json").write_text(json.dumps(stored))
-    assert train("random", tmp_path / "run").read("rows") == run.read("rows")
+    assert train("random", tmp_path / "run").rows() == run.rows()
     with pytest.raises(delayrl.DelayRLError, match="another updates_per_call"):
         train("random", tmp_path / "run", updates_per_call=2)
 
@@ -156,7 +156,7 @@ def test_overwrite_touches_only_runs(tmp_path: Path) -> None:
     assert (mine / "checkpoints" / "best.pt").exists()
     run = train("random", tmp_path / "run", steps=120)
     (run.path / "episode.gif").write_text("x")
-    assert len(train("random", run.path, steps=150, overwrite=True).read("rows")) == 4
+    assert len(train("random", run.path, steps=150, overwrite=True).rows()) == 4
     assert (run.path / "episode.gif").exists()
     with pytest.raises(delayrl.DelayRLError):
         train("random", run.path / "episode.gif", overwrite=True)
@@ -181,7 +181,7 @@ def test_agents_check_the_schedule(tmp_path: Path) -> None:
 
 def test_complete_run_is_given_back(vdpo: Run, monkeypatch) -> None:
     monkeypatch.setattr(Actor, "step", lambda *_: pytest.fail("it trains again"))
-    assert train("vdpo", vdpo.path).read("rows") == vdpo.read("rows")
+    assert train("vdpo", vdpo.path).rows() == vdpo.rows()
 
 
 def test_several_seeds(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_several_seeds(tmp_path: Path) -> None:
     assert [run.path for run in again] == [run.path for run in runs]
     assert [run.path.name for run in runs] == ["seed3", "seed4"]
     alone = train("a-sac", tmp_path / "alone", seed=4, steps=150)
-    for a, b in zip(runs[1].read("rows"), alone.read("rows"), strict=True):
+    for a, b in zip(runs[1].rows(), alone.rows(), strict=True):
         assert a["reset_seed"] == b["reset_seed"]
         np.testing.assert_allclose(a["return"], b["return"], rtol=1e-3)
 
@@ -222,7 +222,7 @@ def test_other_configuration_is_refused(vdpo: Run, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match="not empty"):
         train("bpql", tmp_path / "mine")
     train("bpql", tmp_path / "twice", steps=120)
-    assert len(train("bpql", tmp_path / "twice", steps=150, overwrite=True).read("rows")) == 4
+    assert len(train("bpql", tmp_path / "twice", steps=150, overwrite=True).rows()) == 4
 
 
 @pytest.mark.parametrize("nth", [1, 9])
@@ -244,7 +244,7 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         train("bpql", tmp_path / "run")
     monkeypatch.setattr(os, "fsync", fsync)
     whole = train("bpql", tmp_path / "whole")
-    assert train("bpql", tmp_path / "run").read("rows") == whole.read("rows")
+    assert train("bpql", tmp_path / "run").rows() == whole.rows()
 
 
 @pytest.mark.parametrize(
@@ -270,10 +270,10 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"replay_capacity": 5}, "at least"),
         (
             {"steps": 99},
-            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_st",
+            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_steps$",
         ),
         ({"steps": 100, "update_every": 101, "clone_every": 102}, "the first update is at step 101"),
-        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after, or preset"),
+        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after$"),
         ({"track": "paper"}, "tensorboard or wandb"),
     ],
 )
@@ -292,6 +292,8 @@ def test_a_run_learns_something(steps: int, every: int, fits: bool) -> None:
     with nullcontext() if fits else pytest.raises(delayrl.DelayRLError, match="nothing would be learned"):
         check_fit(setup, task)
     check_fit(resolve("random", "Reacher-v5", 3, "small", "corrected", {"steps": steps}), task)  # never learns
+    with pytest.raises(delayrl.DelayRLError, match=r"step 5,000, .* fewer random_steps, or preset small$"):
+        check_fit(resolve("a-sac", "Reacher-v5", 3, "paper", "corrected", {"steps": 1500}), task)
 
 
 def test_unknown_agent() -> None:
@@ -304,5 +306,5 @@ def test_unknown_agent() -> None:
 def test_a_delay_as_long_as_the_episode(tmp_path: Path) -> None:
     """The agent is blind after the start, and what it did is still learned from."""
     run = train("a-sac", tmp_path / "run", delay=50, random_steps=110)
-    assert {row["length"] for row in run.read("rows")} == {50}
-    assert run.latest().complete
+    assert {row["length"] for row in run.rows()} == {50}
+    assert newest(run).complete

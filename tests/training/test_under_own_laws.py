@@ -31,7 +31,7 @@ def test_a_named_law(tmp_path: Path) -> None:
     """Instance and text are one condition, in a grid too. The run is loaded by the text alone."""
     run = train("random", tmp_path / "run", delay=Burst(0.3))
     assert run.config["delay"] == BURST
-    assert {row["delay"] for row in run.read("rows")} == {BURST}
+    assert {row["delay"] for row in run.rows()} == {BURST}
     assert train("random", tmp_path / "run", delay="own_laws:Burst(rate=0.3)").path == run.path
     with pytest.raises(DelayRLError, match="holds a run with another delay"):
         train("random", tmp_path / "run", delay=Burst(0.4))

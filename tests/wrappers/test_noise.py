@@ -137,7 +137,7 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     options = {"env": "delayrl/NoisyReacher-v4", "delay": 2}
     whole = train("bpql", tmp_path / "whole", **options)
     cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, **options)
-    assert cut.read("rows") == whole.read("rows")
+    assert cut.rows() == whole.rows()
     for name, array in arrays(cut).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
 

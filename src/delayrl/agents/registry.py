@@ -98,7 +98,9 @@ _MATCHED_DIDA = DIDA(
 _MATCHED_DCAC = DCAC(temperature="learned", reward_scale=1.0, batch_size=256)
 _SMALL_SAC = SAC(batch_size=128, entropy_unit="scaled")
 _SMALL_BPQL = replace(_SMALL_SAC, actor_sees="augmented")
-_SMALL_VDPO = VDPO(_SMALL_SAC, width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250)
+_SMALL_VDPO = VDPO(
+    _SMALL_SAC, width=64, layers=2, dropout=0.0, learning_rate=1e-3, clone_every=250, clone_updates=250, tokens=640
+)
 _SMALL_DIDA = DIDA(_SMALL_SAC, expert_steps=10_000, round_steps=250, imitation_updates=250)
 
 _LAYER_NORMED = replace(_MATCHED_BPQL, critic_norm="layer")

@@ -70,6 +70,7 @@ class VDPO:
         Behaviour,
         "who acts in training: delayed, reference, mixture (a coin flip), or lower-q (the one with the lower Q)",
     ] = "lower-q"
+    tokens: Annotated[int, "most hidden states in an update of belief or cloning; 0: those of a whole batch"] = 0
     at_age_0: Annotated[Current, "the delayed policy's action in training where nothing is hidden"] = "reference"
 
     @property
@@ -152,7 +153,7 @@ class VDPO:
         if self.representation != "transformer":
             return state, metrics
         adam, params = optax.adam(self.learning_rate), (state.encoder, state.decoder)
-        batch = unseen(windows), dropout_key
+        batch = unseen(self._some(windows)), dropout_key
         (encoder, decoder), opt_state, loss, _ = descend(adam, self.belief_loss, params, state.belief_opt_state, *batch)
         state = state._replace(encoder=encoder, decoder=decoder, belief_opt_state=opt_state)
         return state, metrics | {"belief_loss": loss}
@@ -160,7 +161,7 @@ class VDPO:
     def clone(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """Take one KL step of the delayed policy towards the reference (B, eq. 11), on the networks in `_cloned`."""
         adam, params = optax.adam(self.learning_rate), self._cloned(state.encoder, state.head)
-        batch = state, unseen(windows), key
+        batch = state, unseen(self._some(windows)), key
         cloned, opt_state, loss, _ = descend(adam, self.clone_loss, params, state.clone_opt_state, *batch)
         return state._replace(**cloned, clone_opt_state=opt_state), {"kl": loss}
 
@@ -192,6 +193,11 @@ class VDPO:
         reference = self.reference.policy(state.reference.actor, x.states)
         pair = (delayed, reference) if self.direction == "reverse" else (reference, delayed)
         return masked_mean(gaussian_kl(*pair).mean(-1), x.mask), None
+
+    def _some(self, windows: Window) -> Window:
+        """Return the windows that belief and cloning learn from: each brings Δ tokens, which is what they cost."""
+        number = -(-self.tokens // windows.delay) if self.tokens else self.reference.batch_size
+        return jax.tree.map(lambda x: x[:number], windows)
 
     def _cloned(self, encoder: Params, head: Params) -> Params:
         """Return the networks that cloning trains: the head, and without a belief loss the transformer too."""

@@ -13,12 +13,16 @@ from dataclasses import dataclass
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+
+from delayrl.core.replay import init
 from delayrl.envs import make
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
+from delayrl.play.policy import spec_of
 from delayrl.run.agents import find_agent
 from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
@@ -32,6 +36,14 @@ GRID = {**PRODUCT, "name": str, "description": str, "include": list, "product": 
 DEFAULTS: dict[str, Any] = {"preset": "paper", "protocol": "corrected", "seeds": 1, "overrides": {}}
 
 
+class Planned(NamedTuple):
+    """A cell, what it resolves to, and the size of its replays."""
+
+    setup: Setup
+    cell: Cell
+    replay_bytes: int
+
+
 @dataclass(frozen=True)
 class Grid:
     """A grid that was read from a file. Its cells are in the order in which they start."""
@@ -40,6 +52,7 @@ class Grid:
     description: str
     source: Path
     cells: tuple[Cell, ...]
+    replay_bytes: int = 0  # of the cell with the largest replays, of all its seeds
 
     @property
     def is_shipped(self) -> bool:
@@ -77,9 +90,11 @@ def load_grid(grid: str | Path) -> Grid:
         _check_overlap(cells)
     except DelayRLError as error:
         raise DelayRLError(f"{source.name}: {error}") from error
-    tasks = [cell.condition.env for _, cell in cells]
-    ordered = sorted((cell for _, cell in cells), key=lambda cell: tasks.index(cell.condition.env))  # task by task
-    return Grid(name, " ".join(table.get("description", "").split()), source, tuple(ordered))
+    tasks = [planned.cell.condition.env for planned in cells]
+    ordered = sorted(cells, key=lambda planned: tasks.index(planned.cell.condition.env))  # task by task
+    largest = max(planned.replay_bytes for planned in cells)
+    description = " ".join(table.get("description", "").split())
+    return Grid(name, description, source, tuple(planned.cell for planned in ordered), largest)
 
 
 def _read(grid: str, folder: Path) -> tuple[Path, dict[str, Any]]:
@@ -96,12 +111,12 @@ def _read(grid: str, folder: Path) -> tuple[Path, dict[str, Any]]:
         raise DelayRLError(f"{source} is not a valid TOML file: {error}") from error
 
 
-def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list[tuple[Setup, Cell]]:
-    """Return the cells of a grid's table and of the grids that it includes, each with its setup."""
+def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list[Planned]:
+    """Return the cells of a grid's table and of the grids that it includes."""
     _check_keys(table, GRID, "the grid")
     if included and "include" in table:
         raise DelayRLError(f"{source.name} includes other grids, so it cannot be included")
-    cells: list[tuple[Setup, Cell]] = []
+    cells: list[Planned] = []
     for other in table.get("include", []):
         path, included_table = _read(str(other), source.parent)
         cells += _expand(included_table, path, included=True)
@@ -158,7 +173,7 @@ def _applicable(overrides: Mapping[str, Any], agent: str) -> dict[str, Any]:
     return {name: value for name, value in overrides.items() if name in known}
 
 
-def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
+def _cells(table: dict[str, Any]) -> Iterator[Planned]:
     """Yield the cells of one product."""
     for key, kind in (("agents", str), ("tasks", str), ("delays", int | float | str)):
         if not table.get(key):
@@ -175,11 +190,12 @@ def _cells(table: dict[str, Any]) -> Iterator[tuple[Setup, Cell]]:
     for env, delay, agent in product(tasks, table["delays"], table["agents"]):
         overrides = json.dumps(_applicable(shared, agent) | table["overrides"].get(agent, {}), default=str)
         try:
-            setup = _setup(agent, env, delay, table["preset"], table["protocol"], overrides)
+            setup, replay_bytes = _setup(agent, env, delay, table["preset"], table["protocol"], overrides)
         except DelayRLError as error:
             raise DelayRLError(f"{agent} on {env}, delay {delay}: {error}") from error
         for seeds in groups:
-            yield setup, Cell(setup.condition, seeds, setup.cell_id(seeds))
+            cell = Cell(setup.condition, seeds, setup.cell_id(seeds))
+            yield Planned(setup, cell, len(seeds) * replay_bytes)
 
 
 def _seed_groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int, ...]]:
@@ -199,19 +215,21 @@ def _seed_groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int
 
 
 @functools.cache  # it builds the task; overrides are JSON to be a key of the cache
-def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str, overrides: str) -> Setup:
-    """Resolve a condition. Raises DelayRLError if it cannot be trained."""
+def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str, overrides: str) -> tuple[Setup, int]:
+    """Resolve a condition. Returns the bytes of a seed's replay too. Raises DelayRLError if it cannot be trained."""
     setup = resolve(agent, env, delay, preset, protocol, json.loads(overrides))
     task = make(env, setup.delay.observed())
     check_fit(setup, task)
+    spec = spec_of(task)
     task.close()
-    return setup
+    replay = jax.eval_shape(lambda: init(spec, setup.schedule.replay_capacity // setup.entries(spec)))
+    return setup, sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(replay))
 
 
-def _check_overlap(cells: list[tuple[Setup, Cell]]) -> None:
+def _check_overlap(cells: list[Planned]) -> None:
     """Raise DelayRLError if a run is in two cells: its rows would count twice."""
     first: dict[tuple[str, int], Cell] = {}
-    for setup, cell in cells:
+    for setup, cell, _ in cells:
         configuration = setup.cell_id(())
         for seed in cell.seeds:
             other = first.setdefault((configuration, seed), cell)

@@ -19,7 +19,7 @@ from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.disk import draft
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 from delayrl.run.rows import EPISODE, Row, check_row, name_configuration
 
 SCHEMA = 1
@@ -47,7 +47,7 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 
 
 def _read_rows(path: Path) -> list[Row]:
-    return name_configuration([check_row(row, path) for row in Run(path).read("rows")])
+    return name_configuration([check_row(row, path) for row in RunFolder(path).read("rows")])
 
 
 def collect(grid: Grid, runs: Path, out: Path) -> int:
@@ -93,7 +93,7 @@ def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, la
     rows = _read_rows(path)
     if not rows:
         return 0
-    config = dict(Run(path).config)
+    config = dict(RunFolder(path).config)
     first = config.pop("versions", None)
     versions = _distinct(([first] if first else []) + later)
     shared = {k: v for k, v in rows[0].items() if k not in EPISODE and all(row.get(k) == v for row in rows)}
@@ -127,7 +127,7 @@ def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the configurations of the runs that have begun."""
     paths = [path for cell in cells for path in folders.seed_folders(runs / cell.folder, cell.seeds)]
-    return [Run(path).config for path in paths if (path / "config.json").exists()]
+    return [RunFolder(path).config for path in paths if (path / "config.json").exists()]
 
 
 def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -1,9 +1,10 @@
-"""Train one cell in a process of its own: `python -m delayrl.bench.worker FOLDER [DEVICE]`.
+"""Train one cell in a process of its own: `python -m delayrl.bench.worker FOLDER [--device DEVICE] [--cores N …]`.
 
 The worker locks the cell, trains it, and prints how that ended as one line of JSON. It stops at a checkpoint on
 SIGTERM, or when the process that started it is gone: its stdin is a pipe, which closes then.
 """
 
+import argparse
 import contextlib
 import json
 import os
@@ -29,10 +30,17 @@ class Outcome(NamedTuple):
 
 def main() -> None:
     """Work on the cell whose folder the command line names."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--device")
+    parser.add_argument("--cores", type=int, nargs="+")
+    given = parser.parse_args()
+    if given.cores and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, given.cores)  # before JAX counts the cores and starts as many threads
     answer = os.fdopen(os.dup(1), "w")  # libraries may print to stdout: that goes to stderr
     os.dup2(2, 1)
     threading.Thread(target=_stop_with_parent, daemon=True).start()
-    outcome = work(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None)
+    outcome = work(given.folder, given.device)
     print(json.dumps(outcome), file=answer, flush=True)
 
 

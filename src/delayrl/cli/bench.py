@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = run.add_argument
     add("--cells", nargs="+", metavar="ID", help="only these cells")
     add("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
-    add("--workers", type=whole, metavar="N", help="cells at a time (default: half of the cores; one with a GPU)")
+    add("--workers", type=whole, metavar="N", help="cells at a time (default: one a core, or one with a GPU)")
     add("--time-limit", type=seconds, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")
     add("--tries", type=whole, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)")
     add("--device", choices=["cpu", "gpu"], help="(default: JAX's choice)")
@@ -121,7 +121,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     if given.backend == "slurm":
         _write_slurm(grid, cells, given)
         return
-    backend, workers = _backend(given)
+    backend, workers = _backend(given, grid, len(cells))
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
     with stop_signal() as stop:
         tries, limit, say, tick = given.tries, given.time_limit, status_line.say, status_line.update
@@ -137,7 +137,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
         sys.exit(STOPPED)
 
 
-def _backend(given: argparse.Namespace) -> tuple[Any, int]:
+def _backend(given: argparse.Namespace, grid: Grid, cells: int) -> tuple[Any, int]:
     """Return the backend, and how many cells it runs at a time."""
     if given.backend == "ray":
         from delayrl.bench.backends.ray import RayBackend
@@ -146,7 +146,7 @@ def _backend(given: argparse.Namespace) -> tuple[Any, int]:
         return ray, max(1, ray.room())
     from delayrl.bench.backends.local import LocalBackend, default_workers
 
-    workers = given.workers or default_workers(given.device)
+    workers = min(cells, given.workers or default_workers(given.device, grid.replay_bytes))
     return LocalBackend(given.runs, workers, given.device), workers
 
 

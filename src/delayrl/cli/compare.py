@@ -23,8 +23,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Print the options that differ and the returns, and draw the learning curves."""
     from delayrl.play.plots import curves
+    from delayrl.play.run import seed_runs
     from delayrl.report.statistics import area, common_steps, mean_interval
-    from delayrl.run.folder import seed_runs
 
     if not 2 <= len(given.runs) <= len(LABELS):
         raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")
@@ -66,6 +66,9 @@ def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
         for name, value in config.items():
             if name not in ABOUT:
                 own |= value if isinstance(value, dict) else {name: value}
+        if origin := own.get("from"):
+            origin = {**origin, "networks": str(origin.get("networks"))[:12]}  # of a hash
+            own["from"] = ", ".join(f"{name} {value}" for name, value in origin.items())
     names = dict.fromkeys(name for own in options for name in own)
     rows = [[name, *(own.get(name, "-") for own in options)] for name in names]
     return [row for row in rows if any(value != row[1] for value in row[2:])]

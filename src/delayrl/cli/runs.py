@@ -15,7 +15,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> None:
     """Print what each run trains, how far it is, and its last return."""
-    from delayrl.run.folder import runs
+    from delayrl.play.run import runs
 
     names = ("agent", "preset", "env", "delay", "seed")
     rows = []

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args, get_origin
 from delayrl.cli import agents
 from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored, add_wrappers, whole
 from delayrl.errors import DelayRLError
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 
 
 def add_options(parser: Parser, words: Sequence[str]) -> None:
@@ -26,6 +26,8 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     if words[0] not in AGENTS and Path(words[0]).is_dir():
         _add_options_of_a_run(parser, words[0])
         return
+    if "/" in words[0]:
+        raise DelayRLError(f"there is no run folder {words[0]}; `delayrl runs` lists the runs below runs/")
     agent = find_agent(words[0])
     parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary
     parser.allow_abbrev = False
@@ -107,16 +109,13 @@ def run(given: argparse.Namespace) -> None:
 
 def _print_summary(run: Run) -> None:
     """Print the last returns of a run, its folder, and what to type next."""
-    import numpy as np
-
-    rows, config = run.read("rows"), run.config
-    last = max((row["step"] for row in rows), default=0)
+    config, last = run.config, max(run.curve().steps, default=0)
     print(f"{config['agent']} on {config['env']}, delay {config['delay']}, seed {config['seed']}: {last:,} steps")
     label = "return under delay" if config["delay"] != 0 else "return"
     for policy, text in (("agent", label), ("reference", "its reference, no delay")):
-        returns = [row["return"] for row in rows if row["step"] == last and row["policy"] == policy]
-        if returns:
-            print(f"  {text:<24} {np.mean(returns):.1f} ± {np.std(returns):.1f}  ({len(returns)} episodes)")
+        steps, returns = run.curve(policy)
+        if last in steps:
+            print(f"  {text:<24} {returns[-1].mean():.1f} ± {returns[-1].std():.1f}  ({len(returns[-1])} episodes)")
     print(f"  run folder               {run.path}")
     print(f"  learning curve           {run.path / 'curve.png'}")
     print(f"  next                     delayrl evaluate {run.path} --episodes 20")

@@ -13,13 +13,13 @@ from delayrl.envs.task import Task, TaskLike
 from delayrl.play.policy import Policy, restored, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder, RunLike
 from delayrl.run.provenance import versions
 from delayrl.run.rows import check_row
 
 
 def export_run(
-    run: str | Path,
+    run: RunLike,
     out: str | Path,
     *,
     force: bool = False,
@@ -39,7 +39,7 @@ def export_run(
         DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
     """
     check_target(Path(out), force=force)
-    source = Run(Path(run))
+    source = RunFolder(Path(run))
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
     task = task_of(run, env)
     policy = restored(source, config, checkpoint, task, agent)
@@ -81,7 +81,7 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     return network, arrays
 
 
-def describe(run: Run, step: int, longest: int, task: Task) -> dict[str, Any]:
+def describe(run: RunFolder, step: int, longest: int, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
     config = run.config
     env = make(task, trained_delay(run.path))
@@ -107,7 +107,7 @@ def describe(run: Run, step: int, longest: int, task: Task) -> dict[str, Any]:
     }
 
 
-def _evaluation(run: Run, step: int) -> dict[str, Any] | None:
+def _evaluation(run: RunFolder, step: int) -> dict[str, Any] | None:
     """Summarise the last evaluation up to the checkpoint at `step`; None if there was none."""
     rows = [check_row(row, run.path / "rows.jsonl") for row in run.read("rows")]
     rows = [row for row in rows if row["policy"] == "agent" and row["step"] <= step]

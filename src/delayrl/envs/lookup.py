@@ -22,7 +22,8 @@ def find_id(name: str) -> str:
     if is_registered(name):
         return name
     near = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
-    hint = f"did you mean {', '.join(near)}?" if near else "`delayrl tasks` lists tasks to choose from"
+    usual = "`delayrl tasks` lists tasks to choose from, and one of your own is MODULE:NAME"
+    hint = f"did you mean {', '.join(near)}?" if near else usual
     raise DelayRLError(f"unknown task {name!r}; {hint}")
 
 
@@ -32,11 +33,12 @@ def find_object(name: str) -> Any:
     The working folder is searched too, as `python -m` does.
 
     Raises:
-        DelayRLError: the module cannot be imported, or has no such object.
+        DelayRLError: the module cannot be imported, or has no such object, or the object is an environment.
     """
     source, _, path = name.partition(":")
     module = find_module(source)
     found = attribute(module, path)
+    refuse_instance(found)
     if callable(found):
         return found
     if is_registered(path):
@@ -45,6 +47,14 @@ def find_object(name: str) -> Any:
     near = difflib.get_close_matches(path, [*known, *gym.registry], n=3, cutoff=0.5)
     hint = f"; did you mean {', '.join(near)}?" if near else ""
     raise DelayRLError(f"module {source!r} has no class or function {path!r}, and registers no such task{hint}")
+
+
+def refuse_instance(thing: Any) -> None:
+    """Raise DelayRLError for an environment where something that makes one is needed."""
+    if isinstance(thing, gym.Env | gym.vector.VectorEnv):
+        what = type(thing.unwrapped).__name__
+        hint = "give its class, a function that makes it, or its id, because evaluation and resuming need fresh ones"
+        raise DelayRLError(f"a task makes environments, and this is one (an instance of {what}): {hint}")
 
 
 def find_stored(name: str, folder: Path) -> Any:

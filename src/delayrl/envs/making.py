@@ -6,13 +6,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import RescaleAction
+from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.single import check_length
+from delayrl.wrappers.single import check_limit as check_limit
 from delayrl.wrappers.single import name_of as name_of
 from delayrl.wrappers.single import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
@@ -25,6 +26,7 @@ def make(
     env_kwargs: Mapping[str, Any] | None = None,
     wrappers: Sequence[WrapperLike] = (),
     flatten: bool = False,
+    normalise: bool = False,
     rescale: bool = False,
     history: int | None = None,
     fill: Fill = "first",
@@ -39,6 +41,8 @@ def make(
         env_kwargs: keyword arguments for what makes the environment, e.g. {"gain": 2}.
         wrappers: between the environment and the delay, innermost first: classes, or names such as "filters:LowPass".
         flatten: join nested observations (Dict, Tuple, images) to one vector.
+        normalise: show deviations from a running mean, in units of the running standard deviation. Both belong to this
+            environment; an agent keeps its own (`observation_norm`), and is trained on the task as it is.
         rescale: whether actions, in `info` too, are in [-1, 1] instead of the task's own range.
         history: rows of the action history, as `Delayed`.
         fill: what is shown before anything has arrived, as `Delayed`.
@@ -51,6 +55,8 @@ def make(
     named = as_task(env, env_kwargs, wrappers, flatten)
     task: Any = named.make(**options)
     check_spaces(str(named), task.observation_space, task.action_space)
+    if normalise:
+        task = NormalizeObservation(task)
     idle = None
     if rescale:
         low, high = task.action_space.low, task.action_space.high

@@ -26,7 +26,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation
 
-from delayrl.envs.lookup import find_id, find_object, find_stored
+from delayrl.envs.lookup import find_id, find_object, find_stored, refuse_instance
 from delayrl.errors import DelayRLError
 from delayrl.lookup import name_of_object, one_line, parse_arguments, with_arguments
 
@@ -195,10 +195,7 @@ def _named(thing: Any) -> Part:
             changed = {name: value for name, value in thing.kwargs.items() if usual.kwargs.get(name) != value}
             return Part(thing.id, _plain(changed))
         return Part(f"<{thing.id}>", {}, thing)
-    if isinstance(thing, gym.Env | gym.vector.VectorEnv):
-        what = type(thing.unwrapped).__name__
-        hint = "give its class, a function that makes it, or its id, because evaluation and resuming need fresh ones"
-        raise DelayRLError(f"a task makes environments, and this is one (an instance of {what}): {hint}")
+    refuse_instance(thing)
     if not callable(thing):
         raise DelayRLError(f"a task is an id, module:function, a class or a function; got {thing!r}")
     return Part(name_of_object(thing), {}, thing)

@@ -16,12 +16,12 @@ from delayrl.agents.base import Agent, State
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
-from delayrl.envs import delay_of, make
+from delayrl.envs.making import check_limit, delay_of, make
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import Run, as_run
+from delayrl.run.folder import RunFolder, RunLike
 
 
 class Episodes(NamedTuple):
@@ -51,6 +51,7 @@ class Evaluator:
         served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
         self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        check_limit(self._envs[0][0], str(as_task(env)))
         self._act = _compiled_act(agent)
 
     def __call__(
@@ -141,7 +142,7 @@ TRAINING, EVALUATION, RANDOM_ACTIONS, HELD_OUT = 0, 1, 2, 3
 
 
 def evaluate(
-    run: str | Path | Run | Policy,
+    run: RunLike | Policy,
     episodes: int = 10,
     delay: DelayLike | None = None,
     seed: int = 0,
@@ -173,13 +174,13 @@ def evaluate(
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
         task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
     else:
-        config, task = as_run(run).config, task_of(run, env, env_kwargs)
+        config, task = RunFolder(Path(run)).config, task_of(run, env, env_kwargs)
         policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
     return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
 
 def sweep(
-    run: str | Path | Run,
+    run: RunLike,
     episodes: int = 10,
     seed: int = 0,
     *,
@@ -188,7 +189,7 @@ def sweep(
     agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
-    name, task = as_run(run).config["agent"], task_of(run, env, env_kwargs)
+    name, task = RunFolder(Path(run)).config["agent"], task_of(run, env, env_kwargs)
     policy = load(run, task, agent=agent)
     for delay in range(policy.spec.delay + 1):
         yield _play(policy, name, task, delay, episodes, seed)

@@ -10,6 +10,7 @@ from gymnasium.wrappers import RescaleAction
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State, template
+from delayrl.core.cache import keep_compiled
 from delayrl.core.types import Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, stored_delay
@@ -19,7 +20,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, agent_of
 from delayrl.run.arrays import restore_tree
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.folder import Run, as_run
+from delayrl.run.folder import RunFolder, RunLike
 
 
 class Policy:
@@ -64,7 +65,7 @@ class Policy:
 
 
 def load(
-    path: str | Path | Run,
+    path: RunLike,
     env: TaskLike | None = None,
     *,
     env_kwargs: Mapping[str, Any] | None = None,
@@ -83,24 +84,25 @@ def load(
     Raises:
         DelayRLError: no run folder, no good checkpoint, one of another agent, a task that cannot be made.
     """
-    run = as_run(path)
-    return restored(run, run.config, run.latest(), task_of(run, env, env_kwargs), agent)
+    keep_compiled()
+    run = RunFolder(Path(path))
+    return restored(run, run.config, run.latest(), task_of(path, env, env_kwargs), agent)
 
 
-def task_of(path: str | Path | Run, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
+def task_of(path: RunLike, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
     """Return the task of a run, or the one given instead, as `load`."""
-    run = as_run(path)
+    run = RunFolder(Path(path))
     return stored_task(run.config["env"], run.path, env, env_kwargs)
 
 
-def trained_delay(path: str | Path | Run) -> Delay:
+def trained_delay(path: RunLike) -> Delay:
     """Return the delay that a run was trained under. A law without a name has its maximum, and cannot be drawn from."""
-    run = as_run(path)
+    run = RunFolder(Path(path))
     return stored_delay(run.config["delay"], run.path)
 
 
 def restored(
-    run: Run, config: dict[str, Any], checkpoint: Checkpoint, task: Task, given: AgentLike | None = None
+    run: RunFolder, config: dict[str, Any], checkpoint: Checkpoint, task: Task, given: AgentLike | None = None
 ) -> Policy:
     """Load the policy in a checkpoint of a run with this configuration, whose task is looked up; `given` as `load`."""
     agent = agent_of(config, run.path, given)

@@ -17,14 +17,15 @@ from tqdm import tqdm
 
 from delayrl.delays import DelayLike
 from delayrl.envs import make
-from delayrl.envs.making import name_of
+from delayrl.envs.making import check_limit, name_of
 from delayrl.envs.task import TaskLike
 from delayrl.errors import DelayRLError, first_line
 from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of, trained_delay
+from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunLike
 
 FASTEST = {".mp4": 60, ".gif": 15}
 """Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""
@@ -44,12 +45,12 @@ class Moment(NamedTuple):
 
 
 def watch(
-    run: str | Path,
+    run: RunLike,
     out: str | Path,
     delay: DelayLike | None = None,
     seed: int = 0,
     camera: str | None = None,
-    compare: str | Path | None = None,
+    compare: RunLike | None = None,
     seconds: float | None = None,
     *,
     env: TaskLike | None = None,
@@ -102,6 +103,7 @@ def watch(
             served = servable(task, trained_delay(path) if delay is None else delay, policy.spec)
             played = make(task, served, render_mode="rgb_array")
             stack.callback(close, played)
+            check_limit(played, str(task))
             rate = float(played.metadata.get("render_fps") or 30)
             stride = max(1, round(rate / FASTEST[out.suffix]))
             titles.append(f"{config['agent']}, delay {served.label()}")

@@ -9,7 +9,7 @@ from typing import Any
 from delayrl.errors import DelayRLError
 from delayrl.report.rows import Key, RowGroup
 from delayrl.run.condition import Condition, overrides_of
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 Config = Mapping[str, Any]
 """What a run's config.json holds."""
@@ -19,7 +19,7 @@ def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
     """Yield the configurations beside rows.jsonl files, and those in files that `benchmarks/collect.py` wrote."""
     for path in paths:
         if (path.parent / "config.json").is_file():
-            yield Run(path.parent).config
+            yield RunFolder(path.parent).config
             continue
         try:
             lines = [line for line in path.read_bytes().splitlines() if b'"config"' in line]

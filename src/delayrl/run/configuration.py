@@ -19,6 +19,7 @@ OLDER: Mapping[str, Any] = {
     "student_optimiser": "rmsprop",
     "temperature": "fixed",
     "update_after": 0,
+    "tokens": 0,
     "observation_norm": "none",
 }
 """Options that were added later, with what an older configuration means that does not mention them."""

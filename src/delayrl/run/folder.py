@@ -17,11 +17,9 @@ import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, save_arrays
@@ -35,24 +33,15 @@ CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "sche
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")
 FILES = (*(f"{name}.jsonl" for name in LINES), "curve.png", "delays.png", "config.json")
-
-
-class Curve(NamedTuple):
-    """Returns of a policy against the environment steps of its training."""
-
-    steps: NDArray[np.int64]  # [evaluations]
-    returns: NDArray[np.float64]  # [evaluations, episodes]
+RunLike = str | PathLike[str]
+"""A run, or the path of its folder."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run folder, or what will be one. `delayrl.load` gives its policy."""
+class RunFolder:
+    """A run folder, or what will be one: what is written to it, and what is read back."""
 
     path: Path
-
-    def __post_init__(self) -> None:
-        """Take the path as text too."""
-        object.__setattr__(self, "path", Path(self.path))
 
     @property
     def exists(self) -> bool:
@@ -82,22 +71,6 @@ class Run:
         if config["format"] != FORMAT:
             raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
         return config  # type: ignore[no-any-return]
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Return one row for each evaluation episode: what was trained, step, start state, return, length."""
-        return self.read("rows")
-
-    def metrics(self) -> list[dict[str, Any]]:
-        """Return losses and speed, a row for every 1,000 steps."""
-        return self.read("metrics")
-
-    def episodes(self) -> list[dict[str, Any]]:
-        """Return one row for each finished episode of training: step of its end, seed, number, return, length."""
-        return self.read("episodes")
-
-    def curve(self, policy: str = "agent") -> Curve:
-        """Return the returns of each evaluation of the agent, or of its delay-free "reference"."""
-        return _curve([row for row in self.rows() if row["policy"] == policy])
 
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""
@@ -213,36 +186,16 @@ class Run:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def _curve(rows: list[dict[str, Any]]) -> Curve:
-    returns: dict[int, list[float]] = {}
-    for row in rows:
-        returns.setdefault(row["step"], []).append(row["return"])
-    steps = sorted(returns)
-    table = np.array([returns[step] for step in steps]).reshape(len(steps), -1 if steps else 0)
-    return Curve(np.array(steps, np.int64), table)
-
-
-def as_run(run: "str | Path | Run") -> Run:
-    """Return the run in a folder, or the run itself."""
-    return run if isinstance(run, Run) else Run(Path(run))
-
-
-def runs(folder: str | Path = "runs") -> list[Run]:
-    """Return all runs in a folder and below it, by their paths. Raises DelayRLError if there is no such folder."""
-    if not Path(folder).is_dir():
-        raise DelayRLError(f"there is no folder {folder}")
-    return [Run(file.parent) for file in sorted(Path(folder).rglob("config.json")) if _is_config(file)]
-
-
-def seed_runs(path: Path) -> list[Run]:
-    """Return the run in a folder, or those of several seeds below it. Raises DelayRLError if there is none."""
+def seed_folders(path: Path) -> list[RunFolder]:
+    """Return the run in a folder, or those of several seeds below it, as `train(seeds=…)` makes them."""
     below = sorted(path.glob("seed*/config.json"), key=lambda file: (len(file.parent.name), file.parent.name))
-    if Run(path).exists or not below:
-        return [Run(path)]
-    return [Run(file.parent) for file in below]
+    if RunFolder(path).exists or not below:
+        return [RunFolder(path)]
+    return [RunFolder(file.parent) for file in below]
 
 
-def _is_config(file: Path) -> bool:
+def is_config(file: Path) -> bool:
+    """Whether a file is the configuration of a run, of any version."""
     try:
         return CONFIG.keys() <= json.loads(file.read_text()).keys()
     except (ValueError, OSError, AttributeError):

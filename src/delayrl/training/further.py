@@ -10,16 +10,17 @@ from delayrl.delays import Delay
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import trained_delay
+from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
-from delayrl.run.folder import Run, as_run, seed_runs
+from delayrl.run.folder import RunFolder, RunLike, seed_folders
 from delayrl.training.loop import Callback
 from delayrl.training.train import train_group
 
 
 def go_on(
-    run: str | Path | Run,
+    run: RunLike,
     steps: int,
     *,
     env: TaskLike | None = None,
@@ -31,7 +32,7 @@ def go_on(
     slim: bool = False,
     callback: Callback | None = None,
     progress: bool = True,
-) -> Any:
+) -> Run | list[Run]:
     """Train a finished or unfinished run further, with its own options, up to more steps.
 
     Its configuration says from then on how long it was before; its rows are those of one result. Options that an agent
@@ -51,19 +52,18 @@ def go_on(
         progress: as `train`.
 
     Returns:
-        The run, or the list of runs.
+        The run, or the list of runs if the folder is that of several.
 
     Raises:
         DelayRLError: no run, fewer steps than it has, a run whose replay is gone, and what `train` raises.
     """
-    folder = as_run(run)
-    runs = seed_runs(folder.path)
+    runs = seed_folders(Path(run))
     configs = [one.config for one in runs]
     task = stored_task(configs[0]["env"], runs[0].path, env, env_kwargs)
     if agent is None:
         agent = str(configs[0]["agent"])
         find_agent(agent, runs[0].path)  # refuses code that came with the folder
-    setup = setup_of(configs[0], agent, task, trained_delay(runs[0]), steps)
+    setup = setup_of(configs[0], agent, task, trained_delay(runs[0].path), steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     for one, config in zip(runs, configs, strict=True):
@@ -81,7 +81,8 @@ def go_on(
         callback=callback,
         progress=progress,
     )
-    return runs[0] if folder.exists else runs
+    ended = [Run(one.path) for one in runs]
+    return ended[0] if runs[0].path == Path(run) else ended
 
 
 def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Delay, steps: int) -> Setup:
@@ -100,7 +101,7 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
     return replace(setup, condition=replace(setup.condition, overrides=overrides_of(setup.config)))
 
 
-def _check(run: Run, config: Mapping[str, Any], first: Mapping[str, Any], steps: int) -> None:
+def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], steps: int) -> None:
     """Raise DelayRLError unless a run can go on to `steps` steps beside the first of its group."""
     checkpoint = run.latest()
     if steps < max(checkpoint.step, config["schedule"]["steps"]):

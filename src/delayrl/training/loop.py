@@ -20,7 +20,7 @@ from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, StoppedError
 from delayrl.play.evaluation import RANDOM_ACTIONS
 from delayrl.play.plots import curve
-from delayrl.run.folder import Run
+from delayrl.play.run import Run
 from delayrl.training.actor import Actor
 from delayrl.training.estimate import estimate
 from delayrl.training.learner import Stored
@@ -59,7 +59,7 @@ def run(
         bar = tqdm(total=steps, initial=state.step, unit="step", **options)
         with stop_signal() as stop, bar:
             loop.train(stop.is_set, bar, callback)
-    for folder in group.runs:
+    for folder in group.folders:
         curve(folder.read("rows"), folder.path / "curve.png")
 
 
@@ -92,7 +92,8 @@ class Loop:
                 bar.set_postfix_str(self._recorder.evaluate(state.step, state.learner.agent))
                 self._recorder.episodes(self._ended)
                 self.state = state = save(self.group, state, complete=state.step == schedule.steps)
-                if callback and callback(state.step, self.group.runs) and state.step < schedule.steps:
+                runs = [Run(folder.path) for folder in self.group.folders]
+                if callback and callback(state.step, runs) and state.step < schedule.steps:
                     return
 
     def step(self) -> None:
@@ -103,12 +104,8 @@ class Loop:
             self.learn()
         actions, state.actions = np.asarray(actions), None
         transitions = self.group.apply(Actor.step, state.actors, actions)
-        state.pending.append(
-            [
-                Stored(transition, hidden_steps(actor, self.group.setup.delay))
-                for transition, actor in zip(transitions, state.actors, strict=True)
-            ]
-        )
+        hidden = [hidden_steps(actor, self.group.setup.delay) for actor in state.actors]
+        state.pending.append([Stored(*step) for step in zip(transitions, hidden, strict=True)])
         state.step += 1
         for actor, ended in zip(state.actors, self._ended, strict=True):
             ended += [{"step": state.step, "seed": actor.seed, **episode} for episode in actor.finished]
@@ -130,16 +127,14 @@ class Loop:
         first = schedule.first_update
         if not self._learning and first <= state.step < schedule.random_steps and not self._can_learn():
             first = state.step + 1  # there is still time
-        state.learner, metrics, learned = group.program.learn(
-            state.learner, state.pending, group.keys, state.step, first
-        )
+        state.learner, metrics, due = group.program.learn(state.learner, state.pending, group.keys, state.step, first)
         state.pending = []
         self._metrics |= metrics
-        if learned and not self._learning:
+        if due and not self._learning:
             self._learning = True
             if not self._can_learn():  # the first block's own steps count too
-                env = group.setup.condition.env
-                raise DelayRLError(f"no episode of {env} is long enough to learn from under this protocol")
+                task = group.setup.condition.env
+                raise DelayRLError(f"no episode of {task} is long enough to learn from under this protocol")
 
     def _act(self) -> Any:
         group, state = self.group, self.state
@@ -161,8 +156,7 @@ class Loop:
 
     def _random_actions(self) -> NDArray[np.float32]:
         generators = [np.random.default_rng([seed, RANDOM_ACTIONS, self.state.step]) for seed in self.group.seeds]
-        size = self.group.spec.action_size
-        return np.stack([generator.uniform(-1, 1, size).astype(np.float32) for generator in generators])
+        return np.array([one.uniform(-1, 1, self.group.spec.action_size) for one in generators], np.float32)
 
 
 def hidden_steps(actor: Actor, delay: Delay) -> np.int32:

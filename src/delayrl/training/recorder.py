@@ -27,7 +27,7 @@ class Recorder:
             "configuration": setup.configuration,
         }
         self._physics = physics(env)
-        self._trackers = [Tracker(track, run.path) for run in group.runs]
+        self._trackers = [Tracker(track, run.path) for run in group.folders]
         task, delay = setup.task, setup.delay
         shape = (len(group.seeds), setup.schedule.evaluation_episodes, group.apply)
         self._evaluators = {"agent": Evaluator(setup.agent, group.spec, task, delay, *shape)}
@@ -53,7 +53,7 @@ class Recorder:
         for policy, evaluator in self._evaluators.items():
             played = evaluator(states[policy], resets, keys, opening if policy == "agent" else None, own)
             summary.append(f"{policy} {played.returns.mean():.4g}")
-            for i, (run, tracker) in enumerate(zip(group.runs, self._trackers, strict=True)):
+            for i, (run, tracker) in enumerate(zip(group.folders, self._trackers, strict=True)):
                 rows = [
                     {
                         **self._columns,
@@ -74,7 +74,7 @@ class Recorder:
 
     def episodes(self, ended: list[list[dict[str, Any]]]) -> None:
         """Write a row for each episode of training that ended, [seeds][episodes], and empty the lists."""
-        for run, own in zip(self._group.runs, ended, strict=True):
+        for run, own in zip(self._group.folders, ended, strict=True):
             if own:
                 run.append("episodes", own)
                 own.clear()
@@ -82,7 +82,7 @@ class Recorder:
     def log(self, step: int, metrics: Metrics, steps_per_second: float) -> None:
         """Write the newest metrics of each seed. Raises DelayRLError for one that is not finite."""
         values = jax.device_get(metrics)
-        for i, (run, tracker) in enumerate(zip(self._group.runs, self._trackers, strict=True)):
+        for i, (run, tracker) in enumerate(zip(self._group.folders, self._trackers, strict=True)):
             own = {name: float(x[i]) for name, x in values.items()}
             for name, x in own.items():
                 if not np.isfinite(x):

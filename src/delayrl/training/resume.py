@@ -15,7 +15,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, flatten_tree, load_arrays, restore_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.configuration import OLDER, values_of
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
 from delayrl.training.cost import cost_of
@@ -34,7 +34,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     Raises:
         DelayRLError: another run or other files in a folder, no common checkpoint, a damaged one.
     """
-    runs, config = group.runs, group.setup.config
+    runs, config = group.folders, group.setup.config
     replaced = [run for run in runs if overwrite and run.exists and run.config]
     for run in replaced:
         run.remove()
@@ -67,9 +67,9 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     return state
 
 
-def source_of(run: Run) -> tuple[dict[str, Any], Checkpoint]:
+def source_of(run: RunFolder) -> tuple[dict[str, Any], Checkpoint]:
     """Return what the configuration says of a run whose networks another one begins with, and its newest checkpoint."""
-    checkpoint, config = run.latest(), run.config
+    config, checkpoint = run.config, run.latest()
     names = ("agent", "env", "delay", "seed", "configuration")
     described = {name: config[name] for name in names if name in config}
     return described | {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}, checkpoint
@@ -117,7 +117,7 @@ def part_of(leaf: str) -> str:
     return ".".join(names[:first])
 
 
-def _common_checkpoints(runs: list[Run], note: Callable[[str], None]) -> list[Checkpoint]:
+def _common_checkpoints(runs: list[RunFolder], note: Callable[[str], None]) -> list[Checkpoint]:
     """Return the newest checkpoint that all seeds have, for each; an empty list where a run begins."""
     good, broken = zip(*(run.checkpoints() for run in runs), strict=True)
     for line in (line for lines in broken for line in lines):
@@ -135,7 +135,7 @@ def _common_checkpoints(runs: list[Run], note: Callable[[str], None]) -> list[Ch
     return []
 
 
-def _check_same(run: Run, wanted: dict[str, Any]) -> None:
+def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
     """Raise DelayRLError if a folder holds a run with another configuration."""
     stored = run.config
     added_later = {**values_of(Schedule()), **OLDER}
@@ -161,7 +161,7 @@ def restore(group: Group, fresh: TrainState, checkpoints: list[Checkpoint]) -> T
         return replace(fresh, step=step, learner=fresh.learner._replace(agent=agent))
     loops = [checkpoint.arrays("loop") for checkpoint in checkpoints]
     replays = []
-    for i, (run, checkpoint, loop) in enumerate(zip(group.runs, checkpoints, loops, strict=True)):
+    for i, (run, checkpoint, loop) in enumerate(zip(group.folders, checkpoints, loops, strict=True)):
         columns = {name: np.array(column[i]) for name, column in fresh.learner.replay._asdict().items()}
         for piece in sorted(checkpoint.pieces):
             _paste(columns, load_arrays(run.path / "replay" / piece))
@@ -201,7 +201,7 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(agent) if np.issubdtype(x.dtype, np.floating)):
         raise DelayRLError(f"weights are not finite at step {state.step}: training diverged; {KEPT}")
     pieces, stored = [], []
-    for i, run in enumerate(group.runs):
+    for i, run in enumerate(group.folders):
         weights = flatten_tree(jax.tree.map(lambda x, i=i: x[i], agent))
         if complete and group.slim:
             run.save(state.step, weights, None, {}, complete=True)
@@ -211,12 +211,12 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
         run.drop_pieces()
         pieces.append(own)
         stored.append(until)
-    for run in group.runs if complete else []:  # once all seeds have their last checkpoint
+    for run in group.folders if complete else []:  # once all seeds have their last checkpoint
         run.finish(slim=group.slim)
     return state if complete else replace(state, pieces=pieces, stored=stored)
 
 
-def _save_replay(run: Run, state: TrainState, seed: int, capacity: int) -> tuple[dict[str, str], tuple[int, int]]:
+def _save_replay(run: RunFolder, state: TrainState, seed: int, capacity: int) -> tuple[dict[str, str], tuple[int, int]]:
     """Write what is new in one seed's replay. Returns the pieces that hold all of it, and up to where."""
     replay = state.learner.replay
     rows, steps = int(replay.rows[seed]), int(replay.steps[seed])

@@ -7,7 +7,7 @@ from pathlib import Path
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.run.condition import Condition
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 
 
 def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
@@ -26,7 +26,7 @@ def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
     return numbers
 
 
-def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[Run]:
+def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[RunFolder]:
     """Return the run folder of each seed: below `out`, or where it is None below runs/."""
     kind = f"{condition.agent.strip('<>')}-{condition.preset}"
     if condition.protocol != "corrected":
@@ -34,5 +34,5 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
     task, kind = (re.sub(r"[^\w.=+@-]+", "-", name) for name in (condition.place, kind))
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
-        return [Run(home)]
-    return [Run(home / f"seed{seed}") for seed in seeds]
+        return [RunFolder(home)]
+    return [RunFolder(home / f"seed{seed}") for seed in seeds]

@@ -11,7 +11,7 @@ from delayrl.agents.base import State
 from delayrl.core.types import Key, Spec
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup
-from delayrl.run.folder import Run
+from delayrl.run.folder import RunFolder
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Learner, Program, Stored
 
@@ -22,7 +22,7 @@ class Group:
 
     setup: Setup
     seeds: list[int]
-    runs: list[Run]  # one folder for each seed
+    folders: list[RunFolder]  # one folder for each seed
     keys: Key  # one random key for each seed
     spec: Spec
     template: State  # shapes and types of the agent's state

@@ -5,22 +5,24 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
 from tqdm import tqdm
 
 from delayrl.agents.base import PRODUCTS, State, template
+from delayrl.core.cache import keep_compiled
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
+from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup, resolve
-from delayrl.run.folder import Run, as_run
+from delayrl.run.folder import RunFolder, RunLike
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.learner import compiled
@@ -29,9 +31,15 @@ from delayrl.training.resume import source_of, start
 from delayrl.training.seeds import run_folders, seed_numbers
 from delayrl.training.state import Group
 from delayrl.wrappers import Delayed
-from delayrl.wrappers.single import limit_of
+from delayrl.wrappers.single import check_limit
 
 
+@overload
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: Literal[1] = 1, **more: Any) -> Run: ...
+@overload
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: Sequence[int], **more: Any) -> list[Run]: ...
+@overload
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: int, **more: Any) -> Run | list[Run]: ...
 def train(
     agent: AgentLike,
     env: TaskLike,
@@ -50,11 +58,11 @@ def train(
     track: str | None = None,
     threads: int = 1,
     slim: bool = False,
-    start_from: str | Path | Run | None = None,
+    start_from: RunLike | None = None,
     callback: Callback | None = None,
     progress: bool = True,
     **values: Any,
-) -> Any:
+) -> Run | list[Run]:
     """Train an agent. The same call resumes an unfinished run, and returns a finished one.
 
     Args:
@@ -91,14 +99,14 @@ def train(
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
     source = None
     if start_from is not None:
-        origin, source = source_of(as_run(start_from))
+        origin, source = source_of(RunFolder(Path(start_from)))
         setup = replace(setup, origin={"from": origin})
     numbers = seed_numbers(seed, seeds)
-    runs = run_folders(setup.condition, numbers, out)
+    folders = run_folders(setup.condition, numbers, out)
     train_group(
         setup,
         numbers,
-        runs,
+        folders,
         given=delay,
         device=device,
         threads=threads,
@@ -109,13 +117,14 @@ def train(
         source=source,
         callback=callback,
     )
+    runs = [Run(folder.path) for folder in folders]
     return runs[0] if seeds == 1 else runs
 
 
 def train_group(
     setup: Setup,
     numbers: list[int],
-    runs: list[Run],
+    folders: list[RunFolder],
     *,
     given: DelayLike | None = None,
     device: str | None = None,
@@ -130,10 +139,10 @@ def train_group(
     """Train seeds in lockstep, each in its folder, from where these stand. The arguments are those of `train`."""
     if threads < 1:
         raise DelayRLError(f"threads must be at least 1; got {threads}")
-    observed = setup.delay.observed()
-    envs = [make(setup.task, observed, rescale=True) for _ in numbers]
+    envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
+    keep_compiled()
     if device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     precision = PRODUCTS[setup.schedule.precision]
@@ -143,7 +152,7 @@ def train_group(
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
         apply = pool.map if threads > 1 else map
-        group = Group(setup, numbers, runs, keys, spec, shapes, program, apply, slim, source)
+        group = Group(setup, numbers, folders, keys, spec, shapes, program, apply, slim, source)
 
         def note(line: str) -> None:
             if progress:
@@ -164,14 +173,13 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
     if first > schedule.steps:
         start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
+        start += "" if setup.condition.preset == "small" else ", or preset small"
         raise DelayRLError(
             f"nothing would be learned: the first update is at step {first:,}, and the run ends at step "
-            f"{schedule.steps:,}; give more steps, {start}, or preset small"
+            f"{schedule.steps:,}; give more steps, {start}"
         )
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
-    if limit_of(env) is None:
-        hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'"
-        raise DelayRLError(f"{setup.task} has no time limit, so evaluation may never end; {hint}")
+    check_limit(env, str(setup.task))
     return template(agent, spec)

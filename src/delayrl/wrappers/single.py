@@ -65,6 +65,13 @@ def limit_of(env: Any) -> int | None:
     return None
 
 
+def check_limit(env: Any, name: str) -> None:
+    """Raise DelayRLError if an environment has no time limit: nobody could wait for the end of its episodes."""
+    if limit_of(env) is None:
+        hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)', or write it behind a | "
+        raise DelayRLError(f"{name} has no time limit, so an episode may never end; {hint}in the task")
+
+
 def check_length(delay: Delay, name: str, limit: int | None) -> None:
     """Raise DelayRLError if a delay is longer than an episode of this task, whose time limit may be unknown."""
     longest = max(delay.maximum, delay.reward.maximum)

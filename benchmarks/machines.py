@@ -1,0 +1,125 @@
+"""Measure how many seed-steps a second this machine trains, by processes and seeds: `python benchmarks/machines.py`.
+
+Each process has its share of the cores, as in `delayrl bench run`, and trains its seeds in lockstep. All of them
+learn while the clock runs. Writes rows and the table in docs/performance.md; `--table` only the table.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from figures import HERE, insert
+
+ROWS = HERE / "results" / "machines.jsonl"
+WORKS = [("sac", 0, "small"), ("vdpo", 5, "small"), ("vdpo", 25, "small"), ("any-age", 25, "small")]
+SEEDS = (1, 4, 8)
+WARM, RANDOM = 300, 1000  # learned steps before the clock runs, and random ones before these
+CHILD = """
+import os, sys, time
+settings, words = [int(x) for x in sys.argv[1].split(",")], sys.argv[2:]
+first, seconds, cores = settings[0], settings[1], settings[2:]
+os.sched_setaffinity(0, cores)
+import jax
+from delayrl.cli.main import main
+from delayrl.training.loop import Loop
+step, began = Loop.step, None
+def timed(self):
+    global began
+    step(self)
+    if self.state.step == first:
+        jax.block_until_ready(self.state.learner)
+        print("ready", flush=True)
+        sys.stdin.readline()
+        began = time.perf_counter()
+    if began is not None and time.perf_counter() - began > seconds:
+        jax.block_until_ready(self.state.learner)
+        print((self.state.step - first) / (time.perf_counter() - began), flush=True)
+        os._exit(0)
+Loop.step = timed
+main(words)
+"""
+
+
+def speed(work: tuple[str, int, str], shares: list[list[int]], seeds: int, seconds: int, home: Path) -> float:
+    """Return the seed-steps a second of processes that learn side by side, each on its share of the cores."""
+    agent, delay, preset = work
+    words = [
+        "train",
+        agent,
+        "--env",
+        "HalfCheetah-v5",
+        "--delay",
+        str(delay),
+        "--preset",
+        preset,
+        "--overwrite",
+        "--quiet",
+    ]
+    words += ["--random-steps", str(RANDOM), "--update-after", str(RANDOM), "--evaluate-every", "200000"]
+    words += ["--steps", "200000", "--replay-capacity", "20000", "--seeds", str(seeds)]
+    children = []
+    for number, share in enumerate(shares):
+        settings = ",".join(map(str, [RANDOM + WARM, seconds, *share]))
+        command = [sys.executable, "-c", CHILD, settings, *words, "--out", str(home / f"run{number}")]
+        children.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+    for child in children:
+        if child.stdout.readline() != "ready\n":
+            raise RuntimeError(f"{agent} did not learn")
+    for child in children:
+        child.stdin.write("go\n")
+        child.stdin.flush()
+    return seeds * sum(float(child.communicate()[0]) for child in children)
+
+
+def measure(rounds: int, seconds: int) -> None:
+    """Measure all works in turn and write the rows."""
+    from delayrl.bench.backends.local import cores, shares
+    from delayrl.run.provenance import versions
+
+    available = cores()
+    ways = [(processes, seeds) for processes in sorted({1, len(available)}) for seeds in SEEDS]
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as home:
+        for number in range(rounds):
+            for work in WORKS:
+                for processes, seeds in ways:
+                    found = speed(work, shares(available, processes), seeds, seconds, Path(home))
+                    about = dict(zip(("agent", "delay", "preset"), work, strict=True))
+                    rows.append(about | {"processes": processes, "seeds": seeds, "round": number, "speed": found})
+                    print(rows[-1], flush=True)
+    about = {"versions": versions(), "cpus": os.cpu_count(), "seconds": seconds}
+    ROWS.write_text("".join(json.dumps(row) + "\n" for row in [about, *rows]))
+
+
+def table() -> str:
+    """Return the medians as Markdown, the best of each line in bold."""
+    about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    ways = list(dict.fromkeys((row["processes"], row["seeds"]) for row in rows))
+    heads = [f"{processes} × {seeds}" for processes, seeds in ways]
+    lines = ["| agent | Δ | " + " | ".join(heads) + " |", "| --- | --- |" + " --- |" * len(ways)]
+    for agent, delay in dict.fromkeys((row["agent"], row["delay"]) for row in rows):
+        own = [row for row in rows if (row["agent"], row["delay"]) == (agent, delay)]
+        medians = [np.median([row["speed"] for row in own if (row["processes"], row["seeds"]) == way]) for way in ways]
+        cells = [f"**{m:,.0f}**" if m == max(medians) else f"{m:,.0f}" for m in medians]
+        lines.append(f"| `{agent}` | {delay} | {' | '.join(cells)} |")
+    rounds = 1 + max(row["round"] for row in rows)
+    words = f"Seed-steps a second, processes × seeds of each; median of {rounds} rounds of {about['seconds']} s of "
+    words += f"learning, HalfCheetah-v5, preset `small`; {about['cpus']} x86 cores, jax {about['versions']['jax']}. "
+    return "\n".join(lines) + f"\n\n{words}Rows: `benchmarks/results/machines.jsonl`."
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=int, default=10)
+    parser.add_argument("--table", action="store_true", help="write the table alone")
+    given = parser.parse_args()
+    if not given.table:
+        measure(given.rounds, given.seconds)
+    insert(HERE.parent / "docs" / "performance.md", "machines", table())

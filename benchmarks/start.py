@@ -1,0 +1,134 @@
+"""Measure the time from starting `delayrl train` to its first learned step, compiling or compiled before.
+
+`python benchmarks/start.py` writes rows and the table in docs/performance.md; `--table` only the table. The ways
+alternate, so that other work on the machine meets both.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from figures import HERE, insert
+
+ROWS = HERE / "results" / "start.jsonl"
+WORKS = [
+    ("sac", 0, "small"),
+    ("bpql", 25, "small"),
+    ("any-age", 25, "small"),
+    ("vdpo", 5, "small"),
+    ("vdpo", 5, "paper"),
+]
+CHILD = """
+import sys, jax
+from delayrl.cli.main import main
+from delayrl.training.learner import Program
+learn = Program.learn
+def first(*args):
+    result = learn(*args)
+    if result[-1]:
+        jax.block_until_ready(result[0])
+        print("learned", flush=True)
+        sys.stdin.read()
+    return result
+Program.learn = first
+main(sys.argv[1:])
+"""
+
+
+def seconds(agent: str, delay: int, preset: str, home: Path, kept: bool) -> float:
+    """Start a run, and stop it once it has learned from its first step. Returns the time until then."""
+    words = ["train", agent, "--env", "HalfCheetah-v5", "--delay", str(delay), "--preset", preset, "--overwrite"]
+    words += [
+        "--random-steps",
+        "200",
+        "--update-after",
+        "200",
+        "--steps",
+        "2000",
+        "--replay-capacity",
+        "20000",
+        "--quiet",
+    ]
+    variables = os.environ | {"XDG_CACHE_HOME": str(home), "JAX_ENABLE_COMPILATION_CACHE": str(int(kept))}
+    began = time.perf_counter()
+    command = [sys.executable, "-c", CHILD, *words, "--out", str(home / "run")]
+    with subprocess.Popen(command, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        line = child.stdout.readline()
+        took = time.perf_counter() - began
+        child.kill()
+    if line != "learned\n":
+        raise RuntimeError(f"{agent} did not learn: {line!r}")
+    return took
+
+
+def measure(rounds: int) -> None:
+    """Measure all works in turn and write the rows."""
+    from delayrl.run.provenance import versions
+
+    rows = []
+    for agent, delay, preset in WORKS:
+        with tempfile.TemporaryDirectory() as home:
+            seconds(agent, delay, preset, Path(home), kept=True)  # compiles
+            for number in range(rounds):
+                for kept in (False, True):
+                    took = seconds(agent, delay, preset, Path(home), kept)
+                    rows.append(
+                        {
+                            "agent": agent,
+                            "delay": delay,
+                            "preset": preset,
+                            "round": number,
+                            "kept": kept,
+                            "seconds": took,
+                        }
+                    )
+                    print(rows[-1], flush=True)
+            size = sum(file.stat().st_size for file in Path(home, "delayrl").rglob("*") if file.is_file())
+            rows[-1]["bytes"] = size
+    ROWS.write_text(
+        "".join(json.dumps(row) + "\n" for row in [{"versions": versions(), "cpus": os.cpu_count()}, *rows])
+    )
+
+
+def table() -> str:
+    """Return the medians as Markdown."""
+    about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    lines = [
+        "| agent | Δ | preset | compiling, s | compiled before, s | kept, MB |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for work in dict.fromkeys((row["agent"], row["delay"], row["preset"]) for row in rows):
+        own = [row for row in rows if (row["agent"], row["delay"], row["preset"]) == work]
+        medians = [np.median([row["seconds"] for row in own if row["kept"] is kept]) for kept in (False, True)]
+        size = next(row["bytes"] for row in own if "bytes" in row)
+        cells: list[Any] = [
+            f"`{work[0]}`",
+            work[1],
+            f"`{work[2]}`",
+            *(f"{m:.1f}" for m in medians),
+            f"{size / 1e6:.1f}",
+        ]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    rounds = 1 + max(row["round"] for row in rows)
+    words = (
+        f"Median of {rounds} rounds, HalfCheetah-v5; {about['cpus']} x86 cores, Python {about['versions']['python']}, "
+    )
+    return "\n".join(lines) + f"\n\n{words}jax {about['versions']['jax']}. Rows: `benchmarks/results/start.jsonl`."
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--table", action="store_true", help="write the table alone")
+    given = parser.parse_args()
+    if not given.table:
+        measure(given.rounds)
+    insert(HERE.parent / "docs" / "performance.md", "start", table())

@@ -1,0 +1,85 @@
+"""Compiled programs are found again by the next process, in a folder to which only the user may write."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CODE = """
+import json, sys, jax
+from delayrl.core import cache
+cache.LARGEST = int(sys.argv[1])
+folder = cache.keep_compiled()
+hits = []
+jax.monitoring.register_event_listener(lambda event, **kwargs: hits.append(event.endswith("cache_hits")))
+result = jax.jit(lambda x: (x @ x).sum(0) * 3)(jax.numpy.ones((20, 20)))
+print(json.dumps([folder and str(folder), sum(hits), result.tolist()]))
+"""
+
+
+def compile_in(home: Path, largest: int = 2**30, **environment: str) -> tuple[str | None, int]:
+    """Compile in a process of its own. Returns the folder, and how many programs were found there."""
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    variables |= {"JAX_PLATFORMS": "cpu", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    variables |= {"XDG_CACHE_HOME": str(home)} | environment
+    words = [sys.executable, "-c", CODE, str(largest)]
+    folder, hits, result = json.loads(subprocess.run(words, env=variables, stdout=subprocess.PIPE, check=True).stdout)
+    assert result == [1200] * 20
+    return folder, hits
+
+
+def test_the_next_process_finds_what_this_one_compiled(tmp_path: Path) -> None:
+    folder, hits = compile_in(tmp_path)
+    assert folder is not None
+    assert hits == 0
+    assert compile_in(tmp_path) == (folder, entries := len(list(Path(folder).iterdir())))
+    assert entries >= 1
+    for path in (Path(folder), Path(folder).parent):
+        assert path.stat().st_mode & 0o777 == 0o700
+    assert compile_in(tmp_path, largest=1) == (folder, 0)  # too large together: deleted, and made again
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path, level: int) -> None:
+    """An entry is code, which any of them could have put there."""
+    folder, _ = compile_in(tmp_path)
+    assert folder is not None
+    path = [Path(folder), Path(folder).parent][level]
+    path.chmod(0o777)
+    assert compile_in(tmp_path) == (None, 0)
+    path.chmod(0o700)
+    real = path.rename(tmp_path / "elsewhere")
+    path.symlink_to(real)
+    assert compile_in(tmp_path) == (None, 0)
+
+
+def test_settings_of_jax_come_first(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    assert compile_in(tmp_path, JAX_COMPILATION_CACHE_DIR=str(elsewhere)) == (None, 0)
+    assert compile_in(tmp_path, JAX_COMPILATION_CACHE_DIR=str(elsewhere))[1] == len(list(elsewhere.iterdir())) > 0
+    assert compile_in(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0") == (None, 0)
+    assert not (tmp_path / "delayrl").exists()
+
+
+def test_without_a_home_nothing_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert compile_in(tmp_path / "file") == (None, 0)
+
+
+@pytest.mark.thorough
+def test_what_was_compiled_before_computes_the_same(tmp_path: Path) -> None:
+    """A run without the folder, one that fills it, and one that takes from it."""
+    words = "train bpql --env Pendulum-v1 --delay 2 --preset small --steps 300 --random-steps 100 --hidden 8 8 --quiet"
+    networks = []
+    for name, kept in (("none", "0"), ("first", "1"), ("second", "1")):
+        variables = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+        variables |= {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": kept, "XDG_CACHE_HOME": str(tmp_path)}
+        options = ["--evaluation-episodes", "1", "--out", str(tmp_path / name)]
+        command = [sys.executable, "-m", "delayrl", *words.split(), *options]
+        subprocess.run(command, env=variables, stdout=subprocess.DEVNULL, check=True)
+        networks.append((tmp_path / name / "checkpoints" / f"{300:012d}" / "agent.safetensors").read_bytes())
+    assert len(list((tmp_path / "delayrl").rglob("*-cache"))) > 0
+    assert networks[0] == networks[1] == networks[2]
