@@ -174,8 +174,8 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     if first > schedule.steps:
         start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
         start += "" if setup.condition.preset == "small" else ", or preset small"
-        line = f"nothing would be learned: the first update is at step {first:,}, and the run ends at step {schedule.steps:,}"
-        raise DelayRLError(f"{line}; give more steps, {start}")
+        line = f"nothing would be learned: the first update is at step {first:,}, and the run ends"
+        raise DelayRLError(f"{line} at step {schedule.steps:,}; give more steps, {start}")
     every, block = schedule.evaluate_every, schedule.updates_per_call
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
