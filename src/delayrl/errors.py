@@ -21,9 +21,11 @@ TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax
 """Modules that the extra `train` brings."""
 
 
-def needs_extra(error: ModuleNotFoundError) -> DelayRLError | None:
-    """Return the error that says which extra brings a missing module; None if it is not one of ours."""
-    module = (error.name or "").partition(".")[0]
+def needs_extra(error: BaseException) -> DelayRLError | None:
+    """Return the error that says which extra brings a missing module; None if no module of ours is missing."""
+    both = (error, error.__cause__)  # Gymnasium raises an error of its own from that of the import
+    names = [one.name or "" for one in both if isinstance(one, ModuleNotFoundError)]
+    module = "".join(names[:1]).partition(".")[0]
     return DelayRLError(f"this needs {module}: pip install 'delayrl[train]'") if module in TRAIN else None
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from delayrl.errors import DelayRLError, described
+from delayrl.errors import DelayRLError, described, needs_extra
 
 
 def find_object(name: str) -> Any:
@@ -126,4 +126,4 @@ def one_line(what: str) -> Iterator[None]:
     except DelayRLError:
         raise
     except (Exception, SystemExit) as error:  # a script without a guard may end the process when it is imported
-        raise DelayRLError(f"{what}: {described(error)}") from error
+        raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)}")) from error

@@ -11,7 +11,7 @@ import pytest
 
 import delayrl
 from delayrl.agents.registry import AGENTS
-from delayrl.cli.console import Parser
+from delayrl.cli.console import Parser, pair
 from delayrl.cli.main import COMMANDS, main
 from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
@@ -108,6 +108,29 @@ def test_watch_ends_quietly(run: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith("delayrl: cannot write ")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("2", 2),
+        (".5", 0.5),
+        ("-1e3", -1000.0),
+        ("true", True),
+        ("False", False),
+        ("None", None),
+        ("[1, 2]", [1, 2]),
+        ('{"a": null}', {"a": None}),
+        ("'7'", "7"),
+        ("arm.xml", "arm.xml"),
+        ("2024-01-02", "2024-01-02"),
+        ("a=b", "a=b"),
+        ("", ""),
+    ],
+)
+def test_values_of_keyword_arguments(text: str, value: object) -> None:
+    assert pair(f"name={text}") == ("name", value)
+    assert type(pair(f"name={text}")[1]) is type(value)
 
 
 def test_a_run_folder_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:

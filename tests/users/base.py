@@ -54,7 +54,13 @@ assert action.shape == (actions,)
 assert Controller
 print("bundle:", bundle.metadata["agent"], "decides in NumPy")
 
-for words in (["train", "sac", "--env", "Pendulum-v1"], ["agents"], ["evaluate", "runs/nothing"]):
+for words in (
+    ["train", "sac", "--env", "Pendulum-v1"],
+    ["agents"],
+    ["evaluate", "runs/nothing"],
+    ["tasks"],
+    ["measure", "HalfCheetah-v5"],
+):
     status, text = delayrl_says(*words)
     assert (status, text.count("\n")) == (2, 1), text
     assert "pip install 'delayrl[train]'" in text, text

@@ -1,6 +1,7 @@
 """What commands share: a parser with errors in one line, tables, and a status line for a terminal or a log."""
 
 import argparse
+import ast
 import json
 import re
 import sys
@@ -40,7 +41,7 @@ class Parser(argparse.ArgumentParser):
 
 def add_env_kwargs(parser: argparse._ActionsContainer) -> None:
     """Add `--env-kwargs`, which gives pairs of a name and a value."""
-    words = "keyword arguments of the environment; values are JSON, else text"
+    words = "keyword arguments of the environment; values as in JSON or Python, else text"
     parser.add_argument("--env-kwargs", nargs="+", action="extend", type=pair, default=[], metavar="NAME=V", help=words)
 
 
@@ -59,14 +60,17 @@ def add_stored(parser: argparse.ArgumentParser) -> None:
 
 
 def pair(word: str) -> tuple[str, Any]:
-    """Return name and value of a word such as `gain=2`. Raises DelayRLError if it is none."""
+    """Return name and value of a word such as `gain=2`. Raises DelayRLError if it is none.
+
+    A value is what JSON or Python reads (`true`, `True`, `.5`), else text: a text "False" would be true.
+    """
     name, equals, text = word.partition("=")
     if not name.isidentifier() or not equals:
         raise DelayRLError(f"keyword arguments are written NAME=VALUE, e.g. gain=2; got {word!r}")
-    try:
-        return name, json.loads(text)
-    except ValueError:
-        return name, text
+    for read in (json.loads, ast.literal_eval):
+        with suppress(ValueError, SyntaxError, TypeError):
+            return name, read(text)
+    return name, text
 
 
 def hyphenated(word: str) -> str:
