@@ -2,7 +2,7 @@
 
 import pytest
 
-from delayrl.errors import DelayRLError, described, first_line, needs_extra
+from delayrl.errors import DelayRLError, described, first_line, near_names, needs_extra
 from delayrl.lookup import one_line
 
 
@@ -26,3 +26,18 @@ def test_an_extra_that_is_missing(module: str) -> None:
 def test_other_modules_are_of_no_extra() -> None:
     assert needs_extra(ModuleNotFoundError(name="mujoco_arm")) is None
     assert needs_extra(NameError(name="jax")) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "near"),
+    [
+        ("gamma", ["grow", "discount"], ["discount"]),
+        ("--buffer_size", ["--batch-size", "--replay-capacity"], ["--replay-capacity"]),
+        ("gamma", ["gammas"], ["gammas"]),  # where there is no such option of ours
+        ("lr", ["layers", "learning_rate", "actor_learning_rate"], ["learning_rate", "actor_learning_rate"]),
+        ("discont", ["discount", "steps"], ["discount"]),
+        ("quite_different", ["discount", "steps"], []),
+    ],
+)
+def test_names_that_may_be_meant(name: str, known: list[str], near: list[str]) -> None:
+    assert near_names(name, known) == near

@@ -29,9 +29,23 @@ def needs_extra(error: BaseException) -> DelayRLError | None:
     return DelayRLError(f"this needs {module}: pip install 'delayrl[train]'") if module in TRAIN else None
 
 
+ELSEWHERE = {
+    "gamma": "discount",
+    "tau": "target_rate",
+    "net_arch": "hidden",
+    "buffer_size": "replay_capacity",
+    "learning_starts": "random_steps",
+    "total_timesteps": "steps",
+}
+"""Options of other libraries, and what they are called here."""
+
+
 def near_names(name: str, known: Iterable[str]) -> list[str]:
-    """Return up to three known names that may be meant: by the initials of their words (`lr`), or by their spelling."""
+    """Return up to three known names that may be meant: by what other libraries call it, by initials, or by spelling."""
     known, letters = list(known), name.strip("-").lower()
+    ours = ELSEWHERE.get(letters.replace("-", "_"))
+    if same := [other for other in known if ours and other.strip("-").replace("-", "_") == ours]:
+        return same
     initials = {other: "".join(word[0] for word in re.findall(r"[^\W_]+", other)) for other in known}
     abbreviated = [other for other in sorted(known, key=len) if initials[other].endswith(letters)]
     if len(letters) > 1 and abbreviated:

@@ -209,7 +209,7 @@ class Recorded:
 def uniform(low: int, high: int) -> Choice:
     """Make a law in which the delays low..high are equally likely."""
     if not whole_steps(low) <= whole_steps(high):
-        raise DelayRLError(f"uniform:LOW:HIGH needs LOW ≤ HIGH; got {low} and {high}")
+        raise DelayRLError(f"delays from LOW to HIGH, as in uniform:2:4, need LOW ≤ HIGH; got {low} and {high}")
     count = high - low + 1
     return Choice(tuple(range(low, high + 1)), (1 / count,) * count, name=f"uniform:{low}:{high}")
 
