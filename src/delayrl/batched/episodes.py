@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
-from delayrl.batched.laws import AnyKey, PerEpisode, draw
+from delayrl.batched.laws import PerEpisode, draw
 from delayrl.batched.transit import Shown, Transit, Travel, begin, issue, receive, show
 
 
@@ -20,11 +20,11 @@ class Episode(NamedTuple):
 
     transit: Transit
     laws: Travel
-    key: AnyKey
+    key: PRNGKeyArray
 
 
 def start(
-    delay: BatchedDelay, key: AnyKey, obs: Float[Array, " obs"], idle: Float[Array, " action"]
+    delay: BatchedDelay, key: PRNGKeyArray, obs: Float[Array, " obs"], idle: Float[Array, " action"]
 ) -> tuple[Episode, Shown]:
     """Start an episode.
 
@@ -103,7 +103,7 @@ def restart(
     return jax.tree.map(lambda new, old: jnp.where(done, new, old), (fresh, first), (episode, shown))
 
 
-def _draw(channel: BatchedChannel, state: Int[Array, ""], key: AnyKey) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def _draw(channel: BatchedChannel, state: Int[Array, ""], key: PRNGKeyArray) -> tuple[Int[Array, ""], Int[Array, ""]]:
     if channel.law is None:
         return jnp.array(channel.maximum, jnp.int32), state
     travel, state = draw(channel.law, state, key)

@@ -4,18 +4,15 @@ The numbers of a law are arrays, so they may change between two calls of a compi
 environment may have its own. As in `delayrl.delays`, a law's state is one integer, 0 at the start of an episode.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from delayrl import delays
 from delayrl.errors import DelayRLError
-
-AnyKey = Key[Array, "*environments"] | UInt32[Array, "*environments 2"]
-"""A random key of either kind of JAX."""
 
 
 class Range(NamedTuple):
@@ -47,7 +44,7 @@ class PerEpisode(NamedTuple):
 Law = Range | Chain | Recording | PerEpisode
 
 
-def draw(law: Law, state: Int[Array, ""], key: AnyKey) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def draw(law: Law, state: Int[Array, ""], key: PRNGKeyArray) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Draw the travel time of the next message of one environment, and the state for the one after it."""
     match law:
         case PerEpisode(inner):
@@ -87,7 +84,7 @@ def _chain(steps: tuple[int, ...], rows: list[tuple[float, ...]]) -> Chain:
     return Chain(jnp.array(steps, jnp.int32), jnp.array(cumulative, jnp.float32))
 
 
-def axes(law: Law | None) -> Law | None:
+def axes(law: Law | None) -> Any:
     """Return `in_axes` of `jax.vmap` for a law: 0 for arrays with a leading axis for environments, None for others."""
     match law:
         case PerEpisode(inner):
@@ -101,5 +98,5 @@ def axes(law: Law | None) -> Law | None:
     return None
 
 
-def _axis(array: Array, rank: int) -> int | None:
+def _axis(array: Array, rank: int) -> Any:
     return 0 if jnp.ndim(array) > rank else None
