@@ -39,7 +39,7 @@ TIGHT = {"rtol": 1e-6}  # a division of small numbers
 
 
 class Journal(Env):
-    """Observation [t, the action that acted, gain · place]; the robot's place is random. It ends after `length` steps."""
+    """Observation [t, the action that acted, gain · place], with a random place. It ends after `length` steps."""
 
     def __init__(self, length: int = 7, named: bool = False):
         self.length, self.named, self.sys = length, named, jnp.array(1.0)
@@ -214,9 +214,13 @@ def test_bad_input() -> None:
 @needs_brax
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
-def test_ppo_of_brax_trains_with_a_privileged_value() -> None:
+def test_ppo_of_brax_trains_with_a_privileged_value(monkeypatch) -> None:
     from brax.training.agents.ppo import networks, train
 
+    def replicated(tree: Any, devices: list) -> Any:  # brax 0.14 calls what JAX 0.12 no longer has
+        return jax.tree.map(lambda array: jnp.stack([array] * len(devices)), tree)
+
+    monkeypatch.setattr(jax, "device_put_replicated", replicated, raising=False)
     factory = partial(
         networks.make_ppo_networks,
         policy_hidden_layer_sizes=(8,),
@@ -247,7 +251,7 @@ def test_ppo_of_brax_trains_with_a_privileged_value() -> None:
 def test_a_task_of_mujoco_playground() -> None:
     """Its own wrapper for training goes inside, and its truth is what it shows without a delay."""
     registry = pytest.importorskip("mujoco_playground").registry
-    task = registry.load("CartpoleBalance")
+    task = registry.load("CartpoleBalance", config_overrides={"impl": "jax"})
     first, states, _ = play(wrap(task, "2+action=1", episode_length=10), 4)
     assert first.obs["state"].shape == (ROBOTS, 5 + 3 + 1)
     np.testing.assert_array_equal(states.obs["state"][2:, :, :5], states.obs["privileged_state"][:2])
