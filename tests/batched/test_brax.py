@@ -217,7 +217,7 @@ def test_bad_input() -> None:
 def test_ppo_of_brax_trains_with_a_privileged_value(monkeypatch) -> None:
     from brax.training.agents.ppo import networks, train
 
-    def replicated(tree: Any, devices: list) -> Any:  # brax 0.14 calls what JAX 0.12 no longer has
+    def replicated(tree: Any, devices: list) -> Any:  # brax 0.14 calls what JAX 0.10 has removed
         return jax.tree.map(lambda array: jnp.stack([array] * len(devices)), tree)
 
     monkeypatch.setattr(jax, "device_put_replicated", replicated, raising=False)

@@ -59,6 +59,9 @@ def test_ranges_per_robot_hold_for_an_episode() -> None:
             told = first.age[robot] if begins == 0 else after.age[robot, begins - 1]
             assert told == lag[0], "the first observation of an episode has its delay of the actions already"
     assert len(seen) > ROBOTS, "the delay differs between episodes"
+    assert after.terminated.sum() == ROBOTS * (STEPS // LENGTH), "what ended is told beside what begins"
+    np.testing.assert_array_equal(after.terminated, now.terminated)
+    np.testing.assert_array_equal(after.reward, now.reward)
 
 
 def test_raw_ages_are_the_travel_times() -> None:
