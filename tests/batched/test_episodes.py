@@ -26,8 +26,8 @@ def play(delay: BatchedDelay, length: int = LENGTH) -> Any:
         obs = jnp.stack([jnp.broadcast_to(time + 1.0, ROBOTS), applied[:, 0]], 1)
         end, no = jnp.broadcast_to(time + 1 == length, ROBOTS), jnp.zeros(ROBOTS, bool)
         episodes, now = jax.vmap(arrive, in_axes=(axes, 0, 0, 0, 0, 0))(delay, episodes, obs, obs[:, 0], end, no)
-        again = jax.vmap(restart, in_axes=(axes, 0, 0, 0, 0, None))
-        episodes, first = again(delay, episodes, now, now.terminated, jnp.zeros((ROBOTS, 2)), idle)
+        again = jax.vmap(restart, in_axes=(axes, 0, 0, 0, 0))
+        episodes, first = again(delay, episodes, now, now.terminated, jnp.zeros((ROBOTS, 2)))
         return (episodes, jnp.where(end[0], 0, time + 1)), (now, first)
 
     keys = jax.random.split(jax.random.key(0), ROBOTS)
@@ -102,8 +102,8 @@ def test_both_kinds_of_keys(make: Any) -> None:
     """The next episode goes on with the key, so it is another one."""
     delay, idle = as_batched("episode:0:50"), jnp.zeros(1)
     episode, shown = start(delay, make(0), jnp.zeros(2), idle)
-    again, first = restart(delay, episode, shown, jnp.array(True), jnp.ones(2), idle)
-    kept, same = restart(delay, episode, shown, jnp.array(False), jnp.ones(2), idle)
+    again, first = restart(delay, episode, shown, jnp.array(True), jnp.ones(2))
+    kept, same = restart(delay, episode, shown, jnp.array(False), jnp.ones(2))
     assert first.obs.tolist() == [1, 1]
     assert same.obs.tolist() == [0, 0]
     data = [np.asarray(jax.random.key_data(e.key)).tolist() for e in (episode, kept, again)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from delayrl.batched import augmented
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
-from delayrl.batched.transit import Shown, Travel, begin, issue, receive, show
+from delayrl.batched.transit import Shown, Travel, begin, issue, receive, renew, show
 from delayrl.delays import (
     Channel,
     Choice,
@@ -146,8 +146,7 @@ def play_batched(delay: BatchedDelay, lengths, truncates, limit, actions, travel
     idle, no = jnp.zeros(actions.shape[1]), jnp.array(False)
 
     def fresh(episode: Any) -> Any:
-        transit = begin(delay, jnp.zeros(2), idle, lags[episode])
-        return transit, show(delay, transit, jnp.zeros(()), no, no)
+        return begin(delay, jnp.zeros(2), idle, lags[episode])
 
     def step(carry: Any, given: Any) -> Any:
         transit, episode, time = carry
@@ -159,12 +158,12 @@ def play_batched(delay: BatchedDelay, lengths, truncates, limit, actions, travel
         truncated = (end & truncates[episode]) | (time + 1 >= limit)
         transit, now = receive(delay, transit, obs, reward, end & ~truncates[episode], truncated, travel)
         done = now.terminated | now.truncated
-        new, first = fresh(episode + done)
-        transit = jax.tree.map(lambda a, b: jnp.where(done, a, b), new, transit)
+        transit = renew(transit, fresh(episode + done), done)
+        first = show(delay, transit, jnp.zeros(()), no, no)
         return (transit, episode + done, jnp.where(done, 0, time + 1)), (now, first)
 
-    start, first = fresh(0)
-    return first, jax.lax.scan(step, (start, 0, 0), (actions, travel))[1]
+    start = fresh(0)
+    return show(delay, start, jnp.zeros(()), no, no), jax.lax.scan(step, (start, 0, 0), (actions, travel))[1]
 
 
 def assert_same(ours: Any, theirs: dict, *, without: tuple[str, ...] = ()) -> None:

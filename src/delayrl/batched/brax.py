@@ -122,7 +122,7 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
         self._check(state, len(rng))
         keys = jax.vmap(jax.random.fold_in, (0, None))(rng, STREAM)
         begin = jax.vmap(start, (self._axes, 0, 0, None))
-        return self._shown(state, *begin(self.delay, keys, self._late(state.obs), self._idle))
+        return self._shown(state, *begin(self.delay, keys, self._late(state.obs), jnp.zeros(self.action_size)))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Issue actions, [N, A]. Where an episode ends, the next one is shown, as brax's own wrapper does it."""
@@ -133,18 +133,14 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
         obs, done = self._late(state.obs), state.done > 0
         receive = jax.vmap(arrive, (self._axes, 0, 0, 0, 0, 0))
         episodes, shown = receive(self.delay, episodes, obs, state.reward, done, jnp.zeros_like(done))
-        again = jax.vmap(restart, (self._axes, 0, 0, 0, 0, None))
-        return self._shown(state, *again(self.delay, episodes, shown, done, obs, self._idle))
+        again = jax.vmap(restart, (self._axes, 0, 0, 0, 0))
+        return self._shown(state, *again(self.delay, episodes, shown, done, obs))
 
     @property
     def observation_size(self) -> dict[str, Any]:
         """The shape of each entry of the observation."""
         state = jax.eval_shape(self.reset, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
         return {name: entry.shape[1:] for name, entry in state.obs.items()}
-
-    @property
-    def _idle(self) -> jax.Array:
-        return jnp.zeros(self.action_size)
 
     def _late(self, obs: Any) -> jax.Array:
         """Return what is delayed of the task's observation, [N, S]."""

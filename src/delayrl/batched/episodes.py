@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
 from delayrl.batched.laws import PerEpisode, draw
-from delayrl.batched.transit import Shown, Transit, Travel, begin, issue, receive, show
+from delayrl.batched.transit import Shown, Transit, Travel, begin, issue, receive, renew, show
 
 
 class Episode(NamedTuple):
@@ -81,12 +81,7 @@ def arrive(
 
 
 def restart(
-    delay: BatchedDelay,
-    episode: Episode,
-    shown: Shown,
-    done: Bool[Array, ""],
-    obs: Float[Array, " obs"],
-    idle: Float[Array, " action"],
+    delay: BatchedDelay, episode: Episode, shown: Shown, done: Bool[Array, ""], obs: Float[Array, " obs"]
 ) -> tuple[Episode, Shown]:
     """Start the next episode where this one is done; elsewhere return both as they are.
 
@@ -95,12 +90,12 @@ def restart(
         episode: from `arrive`.
         shown: from `arrive`. Its reward and its ends stay, as in Gymnasium's autoreset mode "same step".
         done: whether the agent has been told of the end.
-        obs: s_0 of the next episode.
-        idle: as for `start`.
+        obs: s_0 of the next episode; not read elsewhere.
     """
-    fresh, first = start(delay, episode.key, obs, idle)
-    first = first._replace(reward=shown.reward, terminated=shown.terminated, truncated=shown.truncated)
-    return jax.tree.map(lambda new, old: jnp.where(done, new, old), (fresh, first), (episode, shown))
+    fresh, _ = start(delay, episode.key, obs, episode.transit.idle)
+    transit = renew(episode.transit, fresh.transit, done)
+    laws, key = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh[1:], episode[1:])
+    return Episode(transit, laws, key), show(delay, transit, shown.reward, shown.terminated, shown.truncated)
 
 
 def _draw(channel: BatchedChannel, state: Int[Array, ""], key: PRNGKeyArray) -> tuple[Int[Array, ""], Int[Array, ""]]:

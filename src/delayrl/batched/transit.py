@@ -6,6 +6,7 @@ All shapes follow from the longest delays. At step t the agent has issued u_0 ..
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -39,7 +40,8 @@ class Transit(NamedTuple):
     action: Queue
     observations: Float[Array, "slots obs"]  # the true ones, by step, modulo
     applied: Int[Array, " slots"]  # the age of the action that led to each
-    actions: Float[Array, "rows action"]  # as issued, by step, modulo; the idle action where none has been
+    idle: Float[Array, " action"]  # in force before the first action has arrived
+    actions: Float[Array, "rows action"]  # as issued, by step, modulo
     action_age: Int[Array, ""]  # of the action that acts now
     rewards: Float[Array, " reward_slots"]  # by time of arrival, modulo: the sum
     latest_reward: Int[Array, ""]  # when the last one arrives
@@ -82,24 +84,35 @@ def begin(
         action=_empty(delay.action, -1),
         observations=jnp.zeros((slots, len(obs))).at[0].set(obs),
         applied=jnp.zeros(slots, jnp.int32),
-        actions=jnp.tile(idle, (max(delay.maximum, 1), 1)),
+        idle=idle,
+        actions=jnp.zeros((max(delay.maximum, 1), len(idle))),
         action_age=zero,
         rewards=jnp.zeros(delay.reward.maximum + 1),
         latest_reward=zero,
     )
 
 
+def renew(transit: Transit, fresh: Transit, done: Bool[Array, ""]) -> Transit:
+    """Return `fresh`, whose episode has just begun, where this one is done; elsewhere `transit`.
+
+    Of the large rings only the row of s_0 is written, because no row of an earlier episode is read.
+    """
+    chosen = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, transit)
+    first = jnp.where(done, fresh.observations[0], transit.observations[0])
+    return chosen._replace(observations=transit.observations.at[0].set(first), actions=transit.actions)
+
+
 def issue(
     delay: BatchedDelay, transit: Transit, action: Float[Array, " action"], travel: Travel
 ) -> tuple[Transit, Float[Array, " action"]]:
     """Issue an action. Returns the one that acts now."""
-    now, rows, applied = transit.time, len(transit.actions), action
+    now, applied = transit.time, action
     if delay.action.maximum:
         queue = _send(delay.action, transit.action, now, travel.action)
         age = jnp.minimum(now - queue.newest, delay.action.maximum)
-        applied = jnp.where(age > 0, transit.actions[(now - age) % rows], action)
+        applied = jnp.where(age > 0, _issued(transit, now - age), action)
         transit = transit._replace(action=queue, action_age=age)
-    return transit._replace(actions=transit.actions.at[now % rows].set(action)), applied
+    return transit._replace(actions=transit.actions.at[now % len(transit.actions)].set(action)), applied
 
 
 def receive(
@@ -143,7 +156,7 @@ def show(
     made, slots = transit.observation.newest, jnp.arange(delay.maximum)
     age = transit.time - made + transit.lag
     mask = slots < age
-    actions = transit.actions[(transit.time - age + slots) % len(transit.actions)]
+    actions = _issued(transit, transit.time - age + slots)
     place = made % len(transit.observations)
     return Shown(
         obs=transit.observations[place],
@@ -170,6 +183,11 @@ def augmented(delay: BatchedDelay, shown: Shown) -> Float[Array, " input"]:
     if delay.action.rule != "wait":
         parts.append((shown.applied / delay.action.maximum)[None])
     return jnp.concatenate(parts)
+
+
+def _issued(transit: Transit, step: Int[Array, "*steps"]) -> Float[Array, "*steps action"]:
+    """Return the actions of these steps; the idle one of steps before the start."""
+    return jnp.where((step < 0)[..., None], transit.idle, transit.actions[step % len(transit.actions)])
 
 
 def _empty(channel: BatchedChannel, newest: int) -> Queue:
