@@ -32,7 +32,7 @@ VIEWS = {
     "privileged": {"augment": True, "value": "privileged_state"},
 }
 PPO = {"num_minibatches": 32, "unroll_length": 5, "batch_size": 256, "normalize_observations": True, "seed": 0}
-TASKS: dict[str, dict[str, Any]] = {  # brax's own values for these tasks, with an eighth to a quarter of the batch
+TASKS: dict[str, dict[str, Any]] = {  # of brax's notebook, with fewer robots and smaller batches
     "inverted_pendulum": {
         **PPO,
         "num_timesteps": 1_000_000,

@@ -43,7 +43,7 @@ def wrap(
     augment: bool = True,
     training_wrap: Callable[..., Any] | None = None,
 ) -> "DelayWrapper":
-    """Wrap a task for training, with delays: give `partial(wrap, delay=...)` as `wrap_env_fn` of brax's PPO or SAC.
+    """Wrap a task for training, with delays: give `partial(wrap, delay=...)` as `wrap_env_fn` of brax's PPO.
 
     Args:
         env: a task of brax or MuJoCo Playground, not wrapped for training.
