@@ -29,6 +29,9 @@ install_import_hook(
         "delayrl.core.views",
         "delayrl.core.replay",
         "delayrl.agents",
+        "delayrl.batched.laws",
+        "delayrl.batched.transit",
+        "delayrl.batched.episodes",
     ],
     "beartype.beartype",
 )

@@ -1,0 +1,138 @@
+"""PPO of brax under a delay: without knowledge of it, with the augmented state, and with a value of the true state.
+
+    pip install 'delayrl[brax]' matplotlib
+    python examples/ppo_brax.py --task inverted_pendulum --delay 4 --seeds 0 1 2 --out ppo
+
+`blind` sees the late observation alone, `augmented` also the actions since, and `privileged` gives its value function
+the true state. Writes a row for each evaluation to OUT/rows.jsonl, and the curves of all rows there to OUT/curves.png.
+"""
+
+import argparse
+import json
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from brax import envs
+from brax.training.agents.ppo import networks, train
+
+from delayrl.batched.brax import wrap
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+VIEWS = {
+    "blind": {"augment": False, "value": "state"},
+    "augmented": {"augment": True, "value": "state"},
+    "privileged": {"augment": True, "value": "privileged_state"},
+}
+PPO = {"num_minibatches": 32, "unroll_length": 5, "batch_size": 256, "normalize_observations": True, "seed": 0}
+TASKS: dict[str, dict[str, Any]] = {  # of brax's notebook, with fewer robots and smaller batches
+    "inverted_pendulum": {
+        **PPO,
+        "num_timesteps": 1_000_000,
+        "discounting": 0.97,
+        "entropy_cost": 1e-2,
+        "learning_rate": 3e-4,
+        "num_updates_per_batch": 4,
+        "reward_scaling": 10,
+    },
+    "halfcheetah": {
+        **PPO,
+        "num_timesteps": 5_000_000,
+        "discounting": 0.95,
+        "entropy_cost": 1e-3,
+        "learning_rate": 3e-4,
+        "num_updates_per_batch": 8,
+        "unroll_length": 20,
+        "reward_scaling": 1,
+    },
+}
+
+if not hasattr(jax, "device_put_replicated"):  # brax 0.14 calls what JAX 0.10 has removed
+
+    def device_put_replicated(tree: Any, devices: list[Any]) -> Any:
+        return jax.tree.map(lambda array: jnp.stack([array] * len(devices)), tree)
+
+    jax.device_put_replicated = device_put_replicated
+
+
+def learn(given: argparse.Namespace, view: str, seed: int) -> list[dict[str, Any]]:
+    """Train one policy. Returns a row for each evaluation, the mean of 128 episodes."""
+    rows: list[dict[str, Any]] = []
+    began = time.perf_counter()
+    what = {"task": given.task, "delay": given.delay, "view": view, "seed": seed}
+
+    def evaluated(step: int, metrics: dict[str, Any]) -> None:
+        row = {**what, "step": int(step), "return": float(metrics["eval/episode_reward"])}
+        rows.append({**row, "seconds": round(time.perf_counter() - began, 1)})
+        print(json.dumps(rows[-1]), flush=True)
+
+    options = TASKS[given.task] | {"seed": seed}
+    if given.steps:
+        options["num_timesteps"] = given.steps
+    train.train(
+        envs.get_environment(given.task, backend="spring"),
+        episode_length=given.episode_length,
+        num_envs=given.envs,
+        num_evals=given.evaluations,
+        network_factory=partial(networks.make_ppo_networks, value_obs_key=VIEWS[view]["value"]),
+        wrap_env_fn=partial(wrap, delay=given.delay, augment=VIEWS[view]["augment"]),
+        deterministic_eval=True,
+        progress_fn=evaluated,
+        **options,
+    )
+    return rows
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw each seed's returns thinly, and the mean of a view where all its seeds were evaluated."""
+    tasks = sorted({(row["task"], row["delay"]) for row in rows})
+    figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks), 3.5), squeeze=False)
+    for axis, (task, delay) in zip(axes[0], tasks, strict=True):
+        axis.set(title=f"{task}, delay {delay}", xlabel="steps", ylabel="return")
+        for colour, view in enumerate(VIEWS):
+            curves: dict[int, dict[int, float]] = {}
+            for row in rows:
+                if (row["task"], row["delay"], row["view"]) == (task, delay, view):
+                    curves.setdefault(row["seed"], {})[row["step"]] = row["return"]
+            for curve in curves.values():
+                axis.plot(curve.keys(), curve.values(), color=f"C{colour}", alpha=0.3, linewidth=0.8)
+            if curves:
+                steps = sorted(set.intersection(*map(set, curves.values())))
+                means = [np.mean([curve[step] for curve in curves.values()]) for step in steps]
+                axis.plot(steps, means, color=f"C{colour}", label=f"{view} ({len(curves)} seeds)")
+        axis.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--task", choices=TASKS, default="inverted_pendulum")
+    parser.add_argument("--delay", default="4", help="in the text form of delayrl.delays (default: %(default)s)")
+    parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--steps", type=int, help="environment steps of a run (default: the task's)")
+    parser.add_argument("--envs", type=int, default=512, help="simulated robots (default: %(default)s)")
+    parser.add_argument("--episode-length", type=int, default=1000)
+    parser.add_argument("--evaluations", type=int, default=11)
+    parser.add_argument("--out", type=Path, default=Path("ppo"))
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    file = given.out / "rows.jsonl"
+    for seed in given.seeds:
+        for view in given.views:
+            rows = learn(given, view, seed)
+            with file.open("a", encoding="utf-8") as lines:
+                lines.writelines(json.dumps(row) + "\n" for row in rows)
+            draw([json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()], given.out / "curves.png")
+
+
+if __name__ == "__main__":
+    main()

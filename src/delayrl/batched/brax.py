@@ -1,0 +1,182 @@
+"""Delays for tasks of brax and MuJoCo Playground: `wrap` takes the place of their own wrapper for training."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from delayrl.batched.delay import BatchedDelay, as_batched
+from delayrl.batched.episodes import Episode, act, arrive, restart, start
+from delayrl.batched.transit import Shown, augmented
+from delayrl.delays import DelayLike
+from delayrl.errors import DelayRLError
+
+try:
+    from brax.envs.base import State, Wrapper
+    from brax.envs.wrappers import training
+except ModuleNotFoundError as error:
+    raise DelayRLError("this needs brax: pip install 'delayrl[brax]'") from error
+
+NAME = "delay"
+"""Where `state.info` keeps the messages on their way."""
+STREAM = 0xDE1A
+"""Folded into an environment's key, so that its task has the random numbers that it has without a delay."""
+
+
+class Messages(NamedTuple):
+    """What `state.info["delay"]` holds."""
+
+    episodes: Episode
+    obs: Any  # the task's own observation, which its next step may read
+
+
+def wrap(
+    env: Any,
+    delay: DelayLike | BatchedDelay,
+    episode_length: int = 1000,
+    action_repeat: int = 1,
+    randomization_fn: Callable[..., Any] | None = None,
+    *,
+    keys: Sequence[str] = (),
+    augment: bool = True,
+    training_wrap: Callable[..., Any] | None = None,
+) -> "DelayWrapper":
+    """Wrap a task for training, with delays: give `partial(wrap, delay=...)` as `wrap_env_fn` of brax's PPO.
+
+    Args:
+        env: a task of brax or MuJoCo Playground, not wrapped for training.
+        delay: steps, a text ("uniform:1:3+action=2"), a `Delay` or a `BatchedDelay`. A step is one decision.
+        episode_length: time limit, in steps of the task.
+        action_repeat: steps of the task for each decision.
+        randomization_fn: as for brax's wrapper.
+        keys: as for `DelayWrapper`.
+        augment: as for `DelayWrapper`.
+        training_wrap: the wrapper for training that goes inside; None for the one of brax or MuJoCo Playground.
+
+    Raises:
+        DelayRLError: no task of brax; a bad delay, or one that is longer than an episode.
+    """
+    if not all(hasattr(env, name) for name in ("reset", "step", "action_size")):
+        got = type(env).__name__
+        raise DelayRLError(f"wrap takes a task with brax's interface (reset, step, action_size); got {got}")
+    seconds = getattr(env, "dt", None)
+    delay = as_batched(delay, None if seconds is None else float(seconds) * action_repeat)
+    longest, decisions = max(delay.maximum, delay.reward.maximum), episode_length // action_repeat
+    if longest > decisions:
+        raise DelayRLError(f"a delay of {longest} steps is longer than an episode ({decisions} decisions)")
+    inside = training_wrap or _training_wrap(env)
+    options = {"episode_length": episode_length, "action_repeat": action_repeat, "randomization_fn": randomization_fn}
+    return DelayWrapper(inside(env, **options), delay, keys=keys, augment=augment)
+
+
+def _training_wrap(env: Any) -> Callable[..., Any]:
+    """Return the wrapper for training of the library that the task is from."""
+    if type(env).__module__.startswith("mujoco_playground."):
+        from mujoco_playground import wrapper
+
+        return wrapper.wrap_for_brax_training
+    return training.wrap
+
+
+class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
+    """Delay the observations and actions of environments that reset themselves; `wrap` makes it.
+
+    It goes around what a wrapper for training returns. A flat observation s_t of the task becomes a dict:
+      state             x_t: the observation that has arrived, the actions since, and their number divided by Δ
+      privileged_state  s_t: for the value function
+    Of a task whose observation is a dict, `keys` are delayed and the other entries stay as they are. The actions and
+    the age are appended to the first of `keys`, and `privileged_state` is added if the task has none.
+
+    The messages on their way are in `state.info["delay"]`. Their times come from the environments' keys. The messages
+    of an episode end with it, and the next one shows its first observation at once.
+
+    Args:
+        env: environments with a leading axis that reset themselves, such as `brax.envs.training.wrap` returns.
+        delay: as for `wrap`. A law whose arrays have a leading axis gives each environment its own.
+        keys: the entries that are delayed, of an observation that is a dict.
+        augment: whether `state` has the actions and the age; False shows what an agent that knows no delay sees.
+
+    Raises:
+        DelayRLError: a bad delay, or one of the rewards; and, at the first reset, environments that do not reset
+            themselves, observations that are no flat arrays, or laws for another number of environments.
+    """
+
+    def __init__(
+        self, env: Any, delay: DelayLike | BatchedDelay, *, keys: Sequence[str] = (), augment: bool = True
+    ) -> None:
+        super().__init__(env)
+        self.delay, self._keys, self._augment = as_batched(delay), tuple(keys), augment
+        if self.delay.reward.maximum:
+            line = "rewards travel with terminations, and environments that reset themselves cannot wait for one"
+            raise DelayRLError(f"{line}: delay observations and actions, or write the loop with delayrl.batched")
+        self._axes = self.delay.axes()
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start all episodes; `rng` has one key for each environment."""
+        if jax.random.key_data(rng).ndim != 2:
+            line = "a delay goes around the wrapper for training, not inside"
+            raise DelayRLError(f"{line}: give wrap_env_fn=partial(wrap, delay=...) to the training")
+        state = self.env.reset(rng)
+        self._check(state, len(rng))
+        keys = jax.vmap(jax.random.fold_in, (0, None))(rng, STREAM)
+        begin = jax.vmap(start, (self._axes, 0, 0, None))
+        return self._shown(state, *begin(self.delay, keys, self._late(state.obs), jnp.zeros(self.action_size)))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Issue actions, [N, A]. Where an episode ends, the next one is shown, as brax's own wrapper does it."""
+        info = dict(state.info)
+        messages = info.pop(NAME)
+        episodes, applied = jax.vmap(act, (self._axes, 0, 0))(self.delay, messages.episodes, action)
+        state = self.env.step(state.replace(obs=messages.obs, info=info), applied)
+        obs, done = self._late(state.obs), state.done > 0
+        receive = jax.vmap(arrive, (self._axes, 0, 0, 0, 0, 0))
+        episodes, shown = receive(self.delay, episodes, obs, state.reward, done, jnp.zeros_like(done))
+        again = jax.vmap(restart, (self._axes, 0, 0, 0, 0))
+        return self._shown(state, *again(self.delay, episodes, shown, done, obs))
+
+    @property
+    def observation_size(self) -> dict[str, Any]:
+        """The shape of each entry of the observation."""
+        state = jax.eval_shape(self.reset, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
+        return {name: entry.shape[1:] for name, entry in state.obs.items()}
+
+    def _late(self, obs: Any) -> jax.Array:
+        """Return what is delayed of the task's observation, [N, S]."""
+        return jnp.concatenate([obs[key] for key in self._keys], -1) if self._keys else obs
+
+    def _shown(self, state: State, episodes: Episode, shown: Shown) -> State:
+        """Return the state with the observation that the agent sees, and keep the task's own."""
+        own = {key: state.obs[key] for key in self._keys} if self._keys else {"state": state.obs}
+        ends = np.cumsum([entry.shape[-1] for entry in own.values()])[:-1]
+        late = dict(zip(own, jnp.split(shown.obs, ends, axis=-1), strict=True))
+        if self._augment:
+            vectors = jax.vmap(augmented, (self._axes, 0))(self.delay, shown)
+            first = next(iter(late))
+            late[first] = jnp.concatenate([late[first], vectors[:, shown.obs.shape[-1] :]], -1)
+        others = state.obs if self._keys else {}
+        obs = {"privileged_state": shown.truth, **others, **late}
+        return state.replace(obs=obs, info={**state.info, NAME: Messages(episodes, state.obs)})
+
+    def _check(self, state: State, count: int) -> None:
+        """Raise DelayRLError unless the environments can be delayed."""
+        if not any(name.endswith("first_obs") for name in state.info):  # as all wrappers that reset name it
+            raise DelayRLError("a delay goes around environments that reset themselves: use delayrl.batched.brax.wrap")
+        entries = dict(state.obs) if isinstance(state.obs, Mapping) else {"": state.obs}
+        if set(self._keys or [""]) - set(entries):
+            given = f"a dict of {', '.join(entries)}" if "" not in entries else "one array"
+            line = "keys names what is delayed of an observation that is a dict"
+            raise DelayRLError(f"{line}; here it is {given}; got keys={self._keys}")
+        for key in self._keys or [""]:
+            if entries[key].ndim != 2:
+                shape = entries[key].shape[1:]
+                raise DelayRLError(f"observations must be flat vectors; {key or 'the task'} has the shape {shape}")
+        laws = zip(*(jax.tree.leaves(tree, is_leaf=_is_none) for tree in (self._axes, self.delay)), strict=True)
+        for axis, array in laws:
+            if axis == 0 and len(array) != count:
+                raise DelayRLError(f"the delay has laws for {len(array)} environments; there are {count}")
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
