@@ -1,7 +1,7 @@
 """Measure how many seed-steps a second this machine trains, by processes and seeds: `python benchmarks/machines.py`.
 
-Each process has its share of the cores, as in `delayrl bench run`, and trains its seeds in lockstep. All of them
-learn while the clock runs. Writes rows and the table in docs/performance.md; `--table` only the table.
+One process has all cores; of several, each has one, as in `delayrl bench run`. They train their seeds in lockstep, and
+all of them learn while the clock runs. Writes rows and the table in docs/performance.md; `--table` only the table.
 """
 
 import argparse
@@ -79,17 +79,18 @@ def speed(work: tuple[str, int, str], shares: list[list[int]], seeds: int, secon
 
 def measure(rounds: int, seconds: int) -> None:
     """Measure all works in turn and write the rows."""
-    from delayrl.bench.backends.local import cores, shares
     from delayrl.run.provenance import versions
 
-    available = cores()
+    available = sorted(os.sched_getaffinity(0))
     ways = [(processes, seeds) for processes in sorted({1, len(available)}) for seeds in SEEDS]
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as home:
         for number in range(rounds):
             for work in WORKS:
                 for processes, seeds in ways:
-                    found = speed(work, shares(available, processes), seeds, seconds, Path(home))
+                    size = len(available) // processes
+                    shares = [available[i * size : (i + 1) * size] for i in range(processes)]
+                    found = speed(work, shares, seeds, seconds, Path(home))
                     about = dict(zip(("agent", "delay", "preset"), work, strict=True))
                     rows.append(about | {"processes": processes, "seeds": seeds, "round": number, "speed": found})
                     print(rows[-1], flush=True)

@@ -291,7 +291,7 @@ def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> Non
     """They are killed after the grace period, so that a queue's time limit holds."""
     sleep = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"
 
-    def start(folder: Path, device: str | None, share: list[int]) -> subprocess.Popen:
+    def start(folder: Path, device: str | None, core: int | None) -> subprocess.Popen:
         return subprocess.Popen([sys.executable, "-c", sleep], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     monkeypatch.setattr("delayrl.bench.backends.local.start_worker", start)

@@ -51,8 +51,21 @@ def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path, level: in
     path.chmod(0o777)
     assert compile_in(tmp_path) == (None, 0)
     path.chmod(0o700)
-    real = path.rename(tmp_path / "elsewhere")
-    path.symlink_to(real)
+    assert compile_in(tmp_path)[0] == folder
+    tmp_path.chmod(0o777)  # anybody could put another folder in its place
+    assert compile_in(tmp_path) == (None, 0)
+    tmp_path.chmod(0o1777)  # but not here, as in /tmp
+    assert compile_in(tmp_path)[0] == folder
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    """Home folders of clusters are small. What counts is the folder that it leads to."""
+    (tmp_path / "large").mkdir(mode=0o700)
+    (tmp_path / "delayrl").symlink_to(tmp_path / "large")
+    folder, _ = compile_in(tmp_path)
+    assert folder is not None
+    assert Path(folder).parent == tmp_path / "large"
+    (tmp_path / "large").chmod(0o777)
     assert compile_in(tmp_path) == (None, 0)
 
 
@@ -62,6 +75,12 @@ def test_settings_of_jax_come_first(tmp_path: Path) -> None:
     assert compile_in(tmp_path, JAX_COMPILATION_CACHE_DIR=str(elsewhere))[1] == len(list(elsewhere.iterdir())) > 0
     assert compile_in(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0") == (None, 0)
     assert not (tmp_path / "delayrl").exists()
+
+
+def test_a_relative_folder_is_ignored(tmp_path: Path) -> None:
+    folder, _ = compile_in(Path("here"), HOME=str(tmp_path))
+    assert folder is not None
+    assert Path(folder).parent == tmp_path / ".cache" / "delayrl"
 
 
 def test_without_a_home_nothing_is_kept(tmp_path: Path) -> None:

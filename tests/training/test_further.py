@@ -93,6 +93,51 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "--steps" in capsys.readouterr().err
 
 
+def files(folder: Path) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "line"),
+    [
+        ({"threads": 0}, "threads must be at least 1"),
+        ({"track": "mlflow"}, "tensorboard or wandb; got 'mlflow'"),
+        ({"callback": 3}, "callback is a function of the step and the runs; got 3"),
+        ({"device": "cuda"}, "device must be cpu or gpu"),
+        ({"env": "Swimmer-v5"}, "was trained on a task of other sizes than Swimmer-v5"),
+    ],
+)
+def test_what_is_refused_changes_no_run(wrong: dict, line: str, tmp_path: Path) -> None:
+    run = train("random", tmp_path / "run", steps=200)
+    before = files(run.path)
+    with pytest.raises(delayrl.DelayRLError, match=line):
+        delayrl.go_on(run, 300, progress=False, **wrong)
+    assert files(run.path) == before
+    if "env" not in wrong:
+        with pytest.raises(delayrl.DelayRLError, match=line):
+            train("random", run.path, steps=200, overwrite=True, **wrong)
+        assert files(run.path) == before
+
+
+def test_a_service_that_is_not_installed_is_missed_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = train("random", tmp_path / "run", steps=200)
+    monkeypatch.setattr("delayrl.training.checks.find_spec", lambda module: None)
+    with pytest.raises(delayrl.DelayRLError, match=r"--track wandb needs `pip install 'delayrl\[wandb\]'`"):
+        train("random", run.path, steps=200, overwrite=True, track="wandb")
+    assert len(run.rows()) == 4
+
+
+def test_a_run_from_another_goes_on_although_that_one_was_trained_further(tmp_path: Path) -> None:
+    """What it began with stays in its configuration. Afresh, it begins with what the other one has now."""
+    old = train("bpql", tmp_path / "old", steps=200)
+    new = train("bpql", tmp_path / "new", steps=200, start_from=old)
+    origin = new.config["origin"]
+    delayrl.go_on(old, 300, progress=False)
+    assert train("bpql", tmp_path / "new", steps=200, start_from=old).config["origin"] == origin
+    again = train("bpql", tmp_path / "new", steps=200, start_from=old, overwrite=True)
+    assert again.config["origin"]["from"]["step"] == 300
+
+
 def test_networks_of_another_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Those whose sizes fit, before the first update; the notes and the configuration say which run it was."""
     old = train("bpql", tmp_path / "old", steps=200)

@@ -15,8 +15,8 @@ from delayrl.play.evaluation import Evaluator
 from delayrl.play.run import Run
 from delayrl.run.condition import resolve
 from delayrl.training.actor import Actor
+from delayrl.training.checks import check_fit
 from delayrl.training.learner import Program
-from delayrl.training.train import check_fit
 from short_runs import arrays, newest, train
 
 

@@ -27,7 +27,7 @@ from delayrl.run.agents import find_agent
 from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
 from delayrl.run.configuration import check_names, options
-from delayrl.training.train import check_fit
+from delayrl.training.checks import check_fit
 
 LISTS = {"agents": list, "tasks": list, "delays": list}
 TASK = {"env_kwargs": dict, "wrappers": list, "flatten": bool}

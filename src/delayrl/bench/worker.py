@@ -1,4 +1,4 @@
-"""Train one cell in a process of its own: `python -m delayrl.bench.worker FOLDER [--device DEVICE] [--cores N …]`.
+"""Train one cell in a process of its own: `python -m delayrl.bench.worker FOLDER [--device DEVICE] [--core N]`.
 
 The worker locks the cell, trains it, and prints how that ended as one line of JSON. It stops at a checkpoint on
 SIGTERM, or when the process that started it is gone: its stdin is a pipe, which closes then.
@@ -33,10 +33,10 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--device")
-    parser.add_argument("--cores", type=int, nargs="+")
+    parser.add_argument("--core", type=int)
     given = parser.parse_args()
-    if given.cores and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, given.cores)  # before JAX counts the cores and starts as many threads
+    if given.core is not None and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {given.core})  # before JAX counts the cores and starts as many threads
     answer = os.fdopen(os.dup(1), "w")  # libraries may print to stdout: that goes to stderr
     os.dup2(2, 1)
     threading.Thread(target=_stop_with_parent, daemon=True).start()

@@ -121,7 +121,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     if given.backend == "slurm":
         _write_slurm(grid, cells, given)
         return
-    backend, workers = _backend(given, grid, len(cells))
+    backend, workers = _backend(given, grid)
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
     with stop_signal() as stop:
         tries, limit, say, tick = given.tries, given.time_limit, status_line.say, status_line.update
@@ -137,7 +137,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
         sys.exit(STOPPED)
 
 
-def _backend(given: argparse.Namespace, grid: Grid, cells: int) -> tuple[Any, int]:
+def _backend(given: argparse.Namespace, grid: Grid) -> tuple[Any, int]:
     """Return the backend, and how many cells it runs at a time."""
     if given.backend == "ray":
         from delayrl.bench.backends.ray import RayBackend
@@ -146,7 +146,7 @@ def _backend(given: argparse.Namespace, grid: Grid, cells: int) -> tuple[Any, in
         return ray, max(1, ray.room())
     from delayrl.bench.backends.local import LocalBackend, default_workers
 
-    workers = min(cells, given.workers or default_workers(given.device, grid.replay_bytes))
+    workers = given.workers or default_workers(given.device, grid.replay_bytes)
     return LocalBackend(given.runs, workers, given.device), workers
 
 

@@ -1,8 +1,10 @@
 """Keep compiled programs for the next process: compiling is half of the time of a short run (docs/performance.md)."""
 
+import contextlib
 import hashlib
 import os
 import platform
+import stat
 import sys
 from pathlib import Path
 
@@ -15,23 +17,25 @@ LARGEST = 2**29
 def keep_compiled() -> Path | None:
     """Have JAX keep what it compiles in a folder of the user, and take from there what it has compiled before.
 
-    Such an entry is code. So the folder belongs to the user, nobody else may write to it, and it is apart for each kind
-    of processor. JAX's own settings come first: `JAX_COMPILATION_CACHE_DIR=…` for another folder,
-    `JAX_ENABLE_COMPILATION_CACHE=0` for none. No result depends on it.
+    Such an entry is code. So the folder belongs to the user, nobody else may write to it or exchange it, and it is
+    apart for each kind of processor. JAX's own settings come first: `JAX_COMPILATION_CACHE_DIR=…` for another folder,
+    `JAX_ENABLE_COMPILATION_CACHE=0` for none. No result depends on it. The setting holds for the whole process.
 
     Returns:
         The folder; None where JAX is set up already, or where no such folder can be made.
     """
     if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
         return None
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "delayrl" / processor()
     try:
+        given = Path(os.environ.get("XDG_CACHE_HOME", ""))  # a relative one is to be ignored
+        folder = (given if given.is_absolute() else Path.home() / ".cache") / "delayrl" / processor()
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
-        if not _is_private(folder.parent) or not _is_private(folder):
+        folder = folder.resolve()
+        if not _is_private(folder):
             return None
         _prune(folder)
-    except OSError:  # no home, or one that cannot be written to
+    except (OSError, RuntimeError):  # no home, or one that cannot be written to
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
@@ -49,18 +53,29 @@ def processor() -> str:
 
 
 def _is_private(folder: Path) -> bool:
-    """Whether a folder is one of the user's, to which nobody else may write."""
+    """Whether a folder is the user's, and nobody else may write to it, or to a folder above it."""
     if not hasattr(os, "getuid"):  # Windows, where a user's folder is
         return True
-    status = folder.lstat()
-    return folder.is_dir() and not folder.is_symlink() and status.st_uid == os.getuid() and not status.st_mode & 0o022
+    user, own = os.getuid(), (folder, folder.parent)
+    for path in (folder, *folder.parents):
+        status = path.stat()
+        shared = bool(status.st_mode & 0o022)
+        if path not in own and status.st_mode & stat.S_ISVTX:  # as in /tmp: everybody may add, and only touch their own
+            shared = False
+        if shared or status.st_uid not in ((user,) if path in own else (user, 0)):
+            return False
+    return True
 
 
 def _prune(folder: Path) -> None:
-    """Delete the oldest entries if together they are too large."""
-    entries = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime, reverse=True)
+    """Delete the oldest entries if together they are too large. Another process may do so at the same time."""
+    entries = []
+    for file in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            status = file.stat()
+            entries.append((status.st_mtime, status.st_size, file))
     total = 0
-    for file in entries:
-        total += file.stat().st_size
+    for _, size, file in sorted(entries, reverse=True):
+        total += size
         if total > LARGEST:
             file.unlink(missing_ok=True)

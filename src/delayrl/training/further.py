@@ -66,9 +66,6 @@ def go_on(
     setup = setup_of(configs[0], agent, task, trained_delay(runs[0].path), steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
-    for one, config in zip(runs, configs, strict=True):
-        if config["schedule"]["steps"] != steps:
-            one.extend(config | setup.config | {"configuration": setup.configuration})
     numbers = [config["seed"] for config in configs]
     train_group(
         setup,
@@ -80,6 +77,7 @@ def go_on(
         slim=slim,
         callback=callback,
         progress=progress,
+        further=True,
     )
     ended = [Run(one.path) for one in runs]
     return ended[0] if runs[0].path == Path(run) else ended

@@ -39,9 +39,9 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     for run in replaced:
         run.remove()
     for run, seed in zip(runs, group.seeds, strict=True):
-        if run.exists:
+        if run.exists and not group.further:
             _check_same(run, config | {"seed": seed})
-        elif run not in replaced and not run.is_free:
+        elif not run.exists and run not in replaced and not run.is_free:
             raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
     checkpoints = _common_checkpoints(runs, note)
     config |= {"configuration": group.setup.configuration, "versions": versions()}
@@ -60,19 +60,27 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
     state = restore(group, state, checkpoints)
-    for run in runs:
+    for run in runs:  # now that nothing can be refused any more
+        if run.config["schedule"]["steps"] != group.setup.schedule.steps:
+            run.extend(run.config | group.setup.config | {"configuration": group.setup.configuration})
         run.rewind(newest.step)
         if complete:
             run.finish(slim=not newest.can_go_on)
     return state
 
 
-def source_of(run: RunFolder) -> tuple[dict[str, Any], Checkpoint]:
-    """Return what the configuration says of a run whose networks another one begins with, and its newest checkpoint."""
+def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], Checkpoint]:
+    """Return what the configuration says of a run whose networks others begin with, and its newest checkpoint.
+
+    Of runs that have `begun` with it, this is what they say, although it may have been trained further since.
+    """
     config, checkpoint = run.config, run.latest()
     names = ("agent", "env", "delay", "seed", "configuration")
     described = {name: config[name] for name in names if name in config}
-    return described | {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}, checkpoint
+    described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}
+    stored = begun[0].config.get("origin", {}).get("from", {}) if begun and begun[0].checkpoints()[0] else {}
+    same = all(stored.get(name) == described.get(name) for name in ("agent", "env", "delay", "seed"))
+    return stored if same else described, checkpoint
 
 
 def _from_source(group: Group, state: TrainState, note: Callable[[str], None]) -> TrainState:
@@ -164,7 +172,10 @@ def restore(group: Group, fresh: TrainState, checkpoints: list[Checkpoint]) -> T
     for i, (run, checkpoint, loop) in enumerate(zip(group.folders, checkpoints, loops, strict=True)):
         columns = {name: np.array(column[i]) for name, column in fresh.learner.replay._asdict().items()}
         for piece in sorted(checkpoint.pieces):
-            _paste(columns, load_arrays(run.path / "replay" / piece))
+            arrays = load_arrays(run.path / "replay" / piece)
+            if any(arrays[name].shape[1:] != columns[name].shape[1:] for name in ("obs", "action")):
+                raise DelayRLError(f"{run.path} was trained on a task of other sizes than {group.setup.task}")
+            _paste(columns, arrays)
         replays.append(ring.Replay(**(columns | {name: loop[name] for name in COUNTS})))  # type: ignore[arg-type]
         actor = fresh.actors[i]
         actor.replay_episode(int(loop["episode"]), loop["actions"])

@@ -30,6 +30,7 @@ class Group:
     apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other
     slim: bool = False  # whether a finished run keeps only its last networks
     source: Checkpoint | None = None  # of another run, whose networks training begins with
+    further: bool = False  # whether these are runs of fewer steps, which go on
 
     @property
     def replay_rows(self) -> int:

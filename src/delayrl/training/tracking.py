@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from delayrl.errors import DelayRLError
+SERVICES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+"""Where metrics can be logged besides, and the module that this takes."""
 
 
 class Tracker:
@@ -11,21 +12,16 @@ class Tracker:
 
     def __init__(self, kind: str | None, path: Path):
         self._write: Any = None
-        if kind not in (None, "tensorboard", "wandb"):
-            raise DelayRLError(f"track must be tensorboard or wandb; got {kind!r}")
-        try:
-            if kind == "tensorboard":
-                from tensorboardX import SummaryWriter
+        if kind == "tensorboard":
+            from tensorboardX import SummaryWriter
 
-                writer = SummaryWriter(str(path / "tensorboard"))
-                self._write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
-            elif kind == "wandb":
-                import wandb
+            writer = SummaryWriter(str(path / "tensorboard"))
+            self._write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
+        elif kind == "wandb":
+            import wandb
 
-                run = wandb.init(project="delayrl", name=str(path), dir=str(path), reinit="create_new")
-                self._write = lambda step, values: run.log(values, step=step)
-        except ImportError as error:
-            raise DelayRLError(f"--track {kind} needs `pip install 'delayrl[{kind}]'`") from error
+            run = wandb.init(project="delayrl", name=str(path), dir=str(path), reinit="create_new")
+            self._write = lambda step, values: run.log(values, step=step)
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """Log scalars at an environment step."""

@@ -11,12 +11,11 @@ import jax
 import jax.numpy as jnp
 from tqdm import tqdm
 
-from delayrl.agents.base import PRODUCTS, State, template
+from delayrl.agents.base import PRODUCTS
 from delayrl.core.cache import keep_compiled
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
-from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
@@ -25,13 +24,12 @@ from delayrl.run.condition import Setup, resolve
 from delayrl.run.folder import RunFolder, RunLike
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
+from delayrl.training.checks import check_fit, check_ways
 from delayrl.training.learner import compiled
 from delayrl.training.loop import Callback, run
 from delayrl.training.resume import source_of, start
 from delayrl.training.seeds import run_folders, seed_numbers
 from delayrl.training.state import Group
-from delayrl.wrappers import Delayed
-from delayrl.wrappers.single import check_limit
 
 
 @overload
@@ -97,12 +95,12 @@ def train(
         DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
     """
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
-    source = None
-    if start_from is not None:
-        origin, source = source_of(RunFolder(Path(start_from)))
-        setup = replace(setup, origin={"from": origin})
     numbers = seed_numbers(seed, seeds)
     folders = run_folders(setup.condition, numbers, out)
+    source = None
+    if start_from is not None:
+        origin, source = source_of(RunFolder(Path(start_from)), [] if overwrite else folders)
+        setup = replace(setup, origin={"from": origin})
     train_group(
         setup,
         numbers,
@@ -135,10 +133,10 @@ def train_group(
     slim: bool = False,
     source: Checkpoint | None = None,
     callback: Callback | None = None,
+    further: bool = False,
 ) -> None:
     """Train seeds in lockstep, each in its folder, from where these stand. The arguments are those of `train`."""
-    if threads < 1:
-        raise DelayRLError(f"threads must be at least 1; got {threads}")
+    check_ways(threads, track, callback)
     envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
@@ -152,7 +150,7 @@ def train_group(
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
         apply = pool.map if threads > 1 else map
-        group = Group(setup, numbers, folders, keys, spec, shapes, program, apply, slim, source)
+        group = Group(setup, numbers, folders, keys, spec, shapes, program, apply, slim, source, further)
 
         def note(line: str) -> None:
             if progress:
@@ -161,23 +159,3 @@ def train_group(
         if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         run(group, start(group, actors, overwrite, note), note, progress=progress, track=track, callback=callback)
-
-
-def check_fit(setup: Setup, env: Delayed) -> State:
-    """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
-    agent, schedule, spec = setup.agent, setup.schedule, spec_of(env)
-    least = 2 * (spec.delay + agent.ahead(spec)) + 2
-    for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
-        if getattr(schedule, name) < count:
-            raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
-    first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
-    if first > schedule.steps:
-        start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
-        start += "" if setup.condition.preset == "small" else ", or preset small"
-        line = f"nothing would be learned: the first update is at step {first:,}, and the run ends"
-        raise DelayRLError(f"{line} at step {schedule.steps:,}; give more steps, {start}")
-    every, block = schedule.evaluate_every, schedule.updates_per_call
-    if every % block:  # or evaluating would change what is learned
-        raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
-    check_limit(env, str(setup.task))
-    return template(agent, spec)

@@ -7,7 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections import Counter
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -22,20 +22,16 @@ WORKER_BYTES = 3 * 2**29
 
 @dataclass
 class LocalBackend:
-    """Runs up to `workers` cells at a time, each in a process of its own on its share of the cores.
+    """Runs up to `workers` cells at a time, each in a process of its own on one core.
 
-    Two cells on one core each learn more in an hour than two that compete for both (docs/performance.md).
+    Two cells on one core each learn more in an hour than two that share both (docs/performance.md). And a cell's sums
+    are then those of one thread, however many cells run beside it.
     """
 
     runs: Path
     workers: int
     device: str | None = None
-    running: dict[str, tuple[Cell, subprocess.Popen[str], list[int]]] = field(default_factory=dict, init=False)
-    free: list[list[int]] = field(default_factory=list, init=False)  # shares of the cores without a worker
-
-    def __post_init__(self) -> None:
-        """Divide the cores."""
-        self.free = shares(cores(), self.workers)
+    running: dict[str, tuple[Cell, subprocess.Popen[str]]] = field(default_factory=dict)
 
     def room(self) -> int:
         """Return how many more cells may be started now."""
@@ -43,33 +39,32 @@ class LocalBackend:
 
     def start(self, cell: Cell) -> None:
         """Start a worker on a cell. Raises DelayRLError if that fails."""
-        process = start_worker(self.runs / cell.folder, self.device, self.free[0])
-        self.running[cell.id] = cell, process, self.free.pop(0)
+        core = None if uses_accelerator(self.device) else free_core()
+        self.running[cell.id] = cell, start_worker(self.runs / cell.folder, self.device, core)
 
     def ended(self) -> list[tuple[Cell, Outcome]]:
         """Return the cells whose process has ended since the last call."""
-        ended = [entry for entry in self.running.values() if entry[1].poll() is not None]
-        for cell, _, share in ended:
+        ended = [(cell, process) for cell, process in self.running.values() if process.poll() is not None]
+        for cell, _ in ended:
             del self.running[cell.id]
-            self.free.append(share)
-        return [(cell, read_outcome(process)) for cell, process, _ in ended]
+        return [(cell, read_outcome(process)) for cell, process in ended]
 
     def stop(self) -> None:
         """Send SIGTERM, on which `train` stores a checkpoint and ends."""
-        for _, process, _ in self.running.values():
+        for _, process in self.running.values():
             process.terminate()
 
     def close(self) -> None:
         """Kill the workers that still run."""
-        for _, process, _ in self.running.values():
+        for _, process in self.running.values():
             process.kill()
             process.communicate()
         self.running.clear()
 
 
-def start_worker(folder: Path, device: str | None, share: Sequence[int] = ()) -> subprocess.Popen[str]:
+def start_worker(folder: Path, device: str | None, core: int | None = None) -> subprocess.Popen[str]:
     """Start a worker process, which Ctrl-C does not reach. Raises DelayRLError if the disk or the system refuses."""
-    options = [*(["--device", device] if device else []), *(["--cores", *map(str, share)] if share else [])]
+    options = [*(["--device", device] if device else []), *([] if core is None else ["--core", str(core)])]
     command = [sys.executable, "-m", "delayrl.bench.worker", str(folder), *options]
     try:
         with open(folder / "worker.log", "w") as log:
@@ -101,7 +96,7 @@ def default_workers(device: str | None, replay_bytes: int) -> int:
     """
     if uses_accelerator(device):
         return 1
-    return max(1, min(len(cores()), free_memory() // (WORKER_BYTES + replay_bytes)))
+    return max(1, min(cores(), free_memory() // (WORKER_BYTES + replay_bytes)))
 
 
 def uses_accelerator(device: str | None) -> bool:
@@ -109,23 +104,38 @@ def uses_accelerator(device: str | None) -> bool:
     return device != "cpu" and bool(entry_points(group="jax_plugins"))
 
 
-def shares(available: Sequence[int], workers: int) -> list[list[int]]:
-    """Return the cores of each worker: as many for each, none in two shares. Of more workers than cores, no shares."""
-    size = len(available) // workers
-    if size == 0:
-        return [[] for _ in range(workers)]
-    return [list(available[i * size : (i + 1) * size]) for i in range(workers)]
+def free_core() -> int | None:
+    """Return the core with the fewest workers, those of other runners too; None if processes cannot be kept on one."""
+    if not hasattr(os, "sched_setaffinity"):
+        return None
+    taken: Counter[int] = Counter()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended
+            words = (process / "cmdline").read_bytes().split(b"\0")
+            if b"delayrl.bench.worker" in words and b"--core" in words:
+                taken[int(words[words.index(b"--core") + 1])] += 1
+    return min(sorted(os.sched_getaffinity(0)), key=lambda core: taken[core])
 
 
-def cores() -> list[int]:
-    """Return the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
+def cores() -> int:
+    """Return how many cores this process may keep busy: those that it may run on, or a container's share of them."""
+    number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota, _, period = limit("cpu.max").partition(" ")
+    return max(1, min(number, int(quota) // int(period))) if quota.isdigit() and period.isdigit() else number
 
 
 def free_memory() -> int:
-    """Return the bytes that new processes can take; on systems that do not say so, as if there was enough."""
+    """Return the bytes that new processes can take, in a container too; where nobody says, as if there was enough."""
     about = Path("/proc/meminfo")
     found = re.search(r"^MemAvailable:\s+(\d+) kB", about.read_text(), re.MULTILINE) if about.exists() else None
-    return int(found[1]) * 1024 if found else 2**62
+    free = int(found[1]) * 1024 if found else 2**62
+    most, used = limit("memory.max"), limit("memory.current")
+    return min(free, int(most) - int(used)) if most.isdigit() and used.isdigit() else free
+
+
+def limit(name: str) -> str:
+    """Return what a file of the control group of a container says; nothing where there is none."""
+    try:
+        return Path("/sys/fs/cgroup", name).read_text().strip()
+    except OSError:
+        return ""

@@ -1,0 +1,44 @@
+"""What is refused before anything is stored or deleted."""
+
+from importlib.util import find_spec
+from typing import Any
+
+from delayrl.agents.base import State, template
+from delayrl.errors import DelayRLError
+from delayrl.play.policy import spec_of
+from delayrl.run.condition import Setup
+from delayrl.training.tracking import SERVICES
+from delayrl.wrappers import Delayed
+from delayrl.wrappers.single import check_limit
+
+
+def check_ways(threads: int, track: str | None, callback: Any) -> None:
+    """Raise DelayRLError for ways to train that are none."""
+    if threads < 1:
+        raise DelayRLError(f"threads must be at least 1; got {threads}")
+    if track is not None and track not in SERVICES:
+        raise DelayRLError(f"track must be {' or '.join(SERVICES)}; got {track!r}")
+    if track is not None and find_spec(SERVICES[track]) is None:
+        raise DelayRLError(f"--track {track} needs `pip install 'delayrl[{track}]'`")
+    if callback is not None and not callable(callback):
+        raise DelayRLError(f"callback is a function of the step and the runs; got {callback!r}")
+
+
+def check_fit(setup: Setup, env: Delayed) -> State:
+    """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
+    agent, schedule, spec = setup.agent, setup.schedule, spec_of(env)
+    least = 2 * (spec.delay + agent.ahead(spec)) + 2
+    for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
+        if getattr(schedule, name) < count:
+            raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
+    first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
+    if first > schedule.steps:
+        start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
+        start += "" if setup.condition.preset == "small" else ", or preset small"
+        line = f"nothing would be learned: the first update is at step {first:,}, and the run ends"
+        raise DelayRLError(f"{line} at step {schedule.steps:,}; give more steps, {start}")
+    every, block = schedule.evaluate_every, schedule.updates_per_call
+    if every % block:  # or evaluating would change what is learned
+        raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
+    check_limit(env, str(setup.task))
+    return template(agent, spec)
