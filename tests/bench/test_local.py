@@ -1,6 +1,5 @@
 """Workers on this machine: how many, and which cores each has."""
 
-import contextlib
 import json
 import os
 import subprocess
@@ -62,16 +61,18 @@ worker.main()
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not pin processes")
 def test_the_core_with_the_fewest_workers() -> None:
-    """Of this runner and of others, from the moment of their start."""
+    """Of this runner and of others."""
     available = sorted(os.sched_getaffinity(0))
-    sleep = [sys.executable, "-c", "input()", "delayrl.bench.worker", "folder"]
-    with contextlib.ExitStack() as stack:
-        found = []
-        for _ in range(2 * len(available)):
-            found.append(local.free_core())
-            words = [*sleep, "--core", str(found[-1])]
-            stack.callback(stack.enter_context(subprocess.Popen(words, stdin=subprocess.PIPE)).kill)
-        assert found == 2 * available
+    own: dict[int, int | None] = {}
+    for number in range(2 * len(available)):
+        own[-number] = local.free_core(own)
+    assert list(own.values()) == 2 * available
+    sleep = [sys.executable, "-c", "print(flush=True); input()", "delayrl.bench.worker", "--core", str(available[0])]
+    with subprocess.Popen(sleep, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()  # type: ignore[union-attr]
+        assert local.free_core({}) == available[1 % len(available)]
+        assert local.free_core({other.pid: available[-1]}) == available[0]
+        other.kill()
 
 
 def test_the_size_of_a_replay(tmp_path: Path) -> None:

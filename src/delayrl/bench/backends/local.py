@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -31,7 +32,7 @@ class LocalBackend:
     runs: Path
     workers: int
     device: str | None = None
-    running: dict[str, tuple[Cell, subprocess.Popen[str]]] = field(default_factory=dict)
+    running: dict[str, tuple[Cell, subprocess.Popen[str], int | None]] = field(default_factory=dict)
 
     def room(self) -> int:
         """Return how many more cells may be started now."""
@@ -39,24 +40,25 @@ class LocalBackend:
 
     def start(self, cell: Cell) -> None:
         """Start a worker on a cell. Raises DelayRLError if that fails."""
-        core = None if uses_accelerator(self.device) else free_core()
-        self.running[cell.id] = cell, start_worker(self.runs / cell.folder, self.device, core)
+        own = {process.pid: core for _, process, core in self.running.values()}
+        core = None if uses_accelerator(self.device) else free_core(own)
+        self.running[cell.id] = cell, start_worker(self.runs / cell.folder, self.device, core), core
 
     def ended(self) -> list[tuple[Cell, Outcome]]:
         """Return the cells whose process has ended since the last call."""
-        ended = [(cell, process) for cell, process in self.running.values() if process.poll() is not None]
+        ended = [(cell, process) for cell, process, _ in self.running.values() if process.poll() is not None]
         for cell, _ in ended:
             del self.running[cell.id]
         return [(cell, read_outcome(process)) for cell, process in ended]
 
     def stop(self) -> None:
         """Send SIGTERM, on which `train` stores a checkpoint and ends."""
-        for _, process in self.running.values():
+        for _, process, _ in self.running.values():
             process.terminate()
 
     def close(self) -> None:
         """Kill the workers that still run."""
-        for _, process in self.running.values():
+        for _, process, _ in self.running.values():
             process.kill()
             process.communicate()
         self.running.clear()
@@ -104,15 +106,19 @@ def uses_accelerator(device: str | None) -> bool:
     return device != "cpu" and bool(entry_points(group="jax_plugins"))
 
 
-def free_core() -> int | None:
-    """Return the core with the fewest workers, those of other runners too; None if processes cannot be kept on one."""
+def free_core(own: Mapping[int, int | None]) -> int | None:
+    """Return the core with the fewest workers; None if processes cannot be kept on one.
+
+    `own` are the cores of this runner's workers by process: the system may not show a new one yet. It shows those of
+    other runners.
+    """
     if not hasattr(os, "sched_setaffinity"):
         return None
-    taken: Counter[int] = Counter()
+    taken = Counter(own.values())
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has ended
             words = (process / "cmdline").read_bytes().split(b"\0")
-            if b"delayrl.bench.worker" in words and b"--core" in words:
+            if b"delayrl.bench.worker" in words and b"--core" in words and int(process.name) not in own:
                 taken[int(words[words.index(b"--core") + 1])] += 1
     return min(sorted(os.sched_getaffinity(0)), key=lambda core: taken[core])
 
