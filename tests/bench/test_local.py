@@ -55,8 +55,8 @@ worker.work = lambda folder, device: worker.Outcome("done", f"{folder.name} {dev
 worker.main()
 """
     words = [sys.executable, "-c", code, str(tmp_path / "cell"), "--device", "cpu", "--core", str(core)]
-    done = subprocess.run(words, stdin=subprocess.PIPE, capture_output=True, text=True, input=None)
-    assert json.loads(done.stdout) == ["done", f"cell cpu [{core}]"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
+        assert json.loads(worker.stdout.readline()) == ["done", f"cell cpu [{core}]"]  # type: ignore[union-attr]
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not pin processes")
