@@ -1,0 +1,65 @@
+"""Collect runs of `examples/ppo_brax.py` into rows to commit, and write their table and picture in the docs.
+
+`python benchmarks/ppo.py OUT [OUT …]` takes the folders of `--out`; without one, only table and picture are written.
+"""
+
+import argparse
+import json
+import os
+import runpy
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from figures import HERE, insert
+
+ROWS = HERE / "results" / "ppo.jsonl"
+VIEWS = ("blind", "augmented", "privileged")
+
+
+def collect(folders: list[Path]) -> None:
+    """Write the rows of run folders, and the versions that made them."""
+    import brax
+
+    from delayrl.run.provenance import versions
+
+    about = {"versions": versions() | {"brax": brax.__version__}, "cpus": os.cpu_count()}
+    rows = [line for folder in folders for line in (folder / "rows.jsonl").read_text().splitlines()]
+    ROWS.write_text("\n".join([json.dumps(about), *rows]) + "\n")
+
+
+def table() -> str:
+    """Return final returns and returns over training, means and standard deviations over seeds, as Markdown."""
+    about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    curves: dict[tuple[str, str, str], dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
+    seconds: dict[str, float] = defaultdict(float)
+    for row in rows:
+        curves[row["task"], row["delay"], row["view"]][row["seed"]][row["step"]] = row["return"]
+        seconds[row["task"]] = max(seconds[row["task"]], row["seconds"])
+    lines = ["| task | delay | steps | PPO | return | mean over training | each seed |", "|" + " --- |" * 7]
+    for task, delay, view in sorted(curves, key=lambda key: (key[0], VIEWS.index(key[2]))):
+        seeds = [list(curve.values()) for curve in curves[task, delay, view].values()]
+        last, mean = np.array([curve[-1] for curve in seeds]), np.array([np.mean(curve) for curve in seeds])
+        steps = max(next(iter(curves[task, delay, view].values())))
+        each = " · ".join(f"{value:,.0f}" for value in last)
+        spread = [f"{x.mean():,.0f}" + (f" ± {x.std(ddof=1):,.0f}" if len(x) > 1 else "") for x in (last, mean)]
+        lines.append(f"| {task} | {delay} | {steps:,} | {view} | {spread[0]} | {spread[1]} | {each} |")
+    used = about["versions"]
+    longest = ", ".join(f"{task} {value / 60:.0f} min" for task, value in sorted(seconds.items()))
+    made = f"Longest run on a core of its own: {longest}. Made with brax {used['brax']}, jax {used['jax']}, "
+    made += f"{about['cpus']} x86 cores, commit {used['commit']}. Rows: `benchmarks/results/ppo.jsonl`."
+    return "\n".join(lines) + f"\n\nEach return is the mean of 128 episodes with deterministic actions. {made}"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="*", type=Path)
+    given = parser.parse_args()
+    if given.folders:
+        collect(given.folders)
+    draw = runpy.run_path(str(HERE.parent / "examples" / "ppo_brax.py"))["draw"]
+    draw(
+        [row for line in ROWS.read_text().splitlines() if "view" in (row := json.loads(line))],
+        HERE.parent / "docs/img/ppo.png",
+    )
+    insert(HERE.parent / "docs" / "simulators.md", "ppo", table())
