@@ -20,9 +20,40 @@ def test_curves_are_those_of_the_rows(vdpo: Run) -> None:
         assert steps.tolist() == [100, 200, 300]
         rows = [row for row in vdpo.rows() if row["policy"] == policy]
         np.testing.assert_array_equal(returns, np.reshape([row["return"] for row in rows], (3, 2)))
-    nothing = delayrl.Run("nowhere").curve()
-    assert nothing.returns.shape == (0, 0)
-    assert len(nothing.steps) == 0
+    with pytest.raises(delayrl.DelayRLError, match=r"^a curve is that of \"agent\" or \"reference\"; got 'refrence'$"):
+        vdpo.curve("refrence")
+
+
+def test_a_curve_leaves_out_what_a_crash_cut(vdpo: Run, tmp_path: Path) -> None:
+    """An evaluation with fewer episodes than the others, and the half of a line."""
+    kept = [row for row in vdpo.rows() if row["policy"] == "agent"]
+    text = "".join(json.dumps(row) + "\n" for row in kept)
+    (tmp_path / "config.json").write_text(json.dumps(vdpo.config))
+    (tmp_path / "rows.jsonl").write_text(text[:-9])
+    steps, returns = delayrl.Run(tmp_path).curve()
+    assert steps.tolist() == [100, 200]
+    np.testing.assert_array_equal(returns, np.reshape([row["return"] for row in kept[:4]], (2, 2)))
+    (tmp_path / "rows.jsonl").write_text("")
+    nothing = delayrl.Run(tmp_path).curve()
+    assert (nothing.steps.shape, nothing.returns.shape) == ((0,), (0, 0))
+
+
+def test_what_is_no_run(vdpo: Run, tmp_path: Path) -> None:
+    """Folders without a configuration, the folder of several seeds, and what is no folder at all."""
+    for read in (Run.rows, Run.metrics, Run.episodes, Run.curve):
+        with pytest.raises(delayrl.DelayRLError, match=r"^nowhere is not a run folder: it has no config.json$"):
+            read(delayrl.Run("nowhere"))
+    for seed in (10, 3):
+        (tmp_path / f"seed{seed}").mkdir()
+        (tmp_path / f"seed{seed}" / "config.json").write_text(json.dumps(vdpo.config))
+    for use in (delayrl.evaluate, delayrl.load, lambda run: delayrl.train("bpql", "Reacher-v5", 3, start_from=run)):
+        with pytest.raises(delayrl.DelayRLError) as error:
+            use(tmp_path)
+        assert str(error.value).endswith(f"config.json; its runs are {tmp_path / 'seed3'}, {tmp_path / 'seed10'}")
+    for use in (delayrl.Run, delayrl.load, delayrl.evaluate):
+        for thing, got in (([vdpo, vdpo], "this is a list of runs"), (3, "got 3"), (None, "got None")):
+            with pytest.raises(delayrl.DelayRLError, match=f"^give one run, or the path of its folder; {got}$"):
+                use(thing)
 
 
 def test_episodes_of_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +20,7 @@ from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import RunFolder, RunLike
+from delayrl.run.folder import RunFolder, RunLike, path_of
 
 
 class Episodes(NamedTuple):
@@ -174,7 +173,7 @@ def evaluate(
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
         task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
     else:
-        config, task = RunFolder(Path(run)).config, task_of(run, env, env_kwargs)
+        config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)
         policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
     return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
@@ -189,7 +188,7 @@ def sweep(
     agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
-    name, task = RunFolder(Path(run)).config["agent"], task_of(run, env, env_kwargs)
+    name, task = RunFolder(path_of(run)).config["agent"], task_of(run, env, env_kwargs)
     policy = load(run, task, agent=agent)
     for delay in range(policy.spec.delay + 1):
         yield _play(policy, name, task, delay, episodes, seed)

@@ -25,7 +25,7 @@ from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import RunLike
+from delayrl.run.folder import RunLike, path_of
 
 FASTEST = {".mp4": 60, ".gif": 15}
 """Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""
@@ -90,7 +90,7 @@ def watch(
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # what pygame draws with
-    paths = [Path(run)] if compare is None else [Path(run), Path(compare)]
+    paths = [path_of(one) for one in ([run] if compare is None else [run, compare])]
     configs = [Run(path).config for path in paths]
     if configs[0]["env"] != configs[-1]["env"]:
         raise DelayRLError(f"--compare takes a run on {configs[0]['env']}; got one on {configs[-1]['env']}")
