@@ -15,10 +15,11 @@ from delayrl.agents.base import Agent, State
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
-from delayrl.envs.making import check_limit, delay_of, make
+from delayrl.envs.making import check_limit, delay_of, make, name_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
-from delayrl.play.policy import Policy, load, task_of, trained_delay
+from delayrl.play import stepping
+from delayrl.play.policy import Policy, load, spec_of, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import RunFolder, RunLike, path_of
 
@@ -50,6 +51,7 @@ class Evaluator:
         served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
         self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        check_fits(self._envs[0][0], spec)
         check_limit(self._envs[0][0], str(as_task(env)))
         self._act = _compiled_act(agent)
 
@@ -69,7 +71,7 @@ class Evaluator:
         shape = (len(self._envs), len(self._envs[0]))
         returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
         seen = [
-            [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
+            [self._see(*stepping.reset(env, int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
         if travel_seeds is not None:
@@ -95,7 +97,7 @@ class Evaluator:
         return Episodes(returns, lengths)
 
     def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
-        return self._envs[at[0]][at[1]].step(action)
+        return stepping.step(self._envs[at[0]][at[1]], action)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
         return seen_now(obs, info, self._delay, privileged=False)
@@ -107,6 +109,14 @@ def servable(env: TaskLike, delay: DelayLike, spec: Spec) -> Delay:
     if served.maximum > spec.delay:
         raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {served.maximum}")
     return served
+
+
+def check_fits(env: Any, spec: Spec) -> None:
+    """Raise DelayRLError if observations or actions of a task have other sizes than those of a policy."""
+    wanted, found = ((one.obs_size, one.action_size) for one in (spec, spec_of(env)))
+    if wanted != found:
+        line = "the policy takes observations of size {} and gives actions of size {}".format(*wanted)
+        raise DelayRLError("{}; {} has sizes {} and {}".format(line, name_of(env), *found))
 
 
 @functools.cache
@@ -127,8 +137,8 @@ def _compiled_act(agent: Agent) -> Any:
 
 def check_seed(seed: int) -> None:
     """Raise DelayRLError unless a seed is a whole number from 0 to 2³¹ - 1."""
-    if not 0 <= seed < 2**31:
-        raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed}")
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**31:
+        raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed!r}")
 
 
 def reset_seed(seed: int, *stream: int) -> int:
@@ -195,8 +205,8 @@ def sweep(
 
 
 def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:
-    if episodes < 1:
-        raise DelayRLError(f"episodes must be at least 1; got {episodes}")
+    if not isinstance(episodes, int | np.integer) or episodes < 1:
+        raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
     check_seed(seed)
     parsed = delay_of(task, delay)
     evaluator = Evaluator(policy.agent, policy.spec, task, parsed, 1, episodes)
@@ -208,7 +218,7 @@ def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int
         "agent": name,
         "env": str(task),
         "delay": parsed.label(),
-        "episodes": episodes,
+        "episodes": int(episodes),
         "mean_return": float(returns.mean()),
         "std_return": float(returns.std()),
         "returns": returns.tolist(),

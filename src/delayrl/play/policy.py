@@ -47,8 +47,10 @@ class Policy:
                 `Delayed` puts there.
 
         Raises:
-            DelayRLError: wrong sizes, or an age that the policy was not trained for.
+            DelayRLError: wrong sizes, no age or actions, or an age that the policy was not trained for.
         """
+        if not {"age", "actions"} <= info.keys():
+            raise DelayRLError("the policy needs the info that `Delayed` gives: it has no age and actions here")
         obs, actions, age = np.asarray(obs), np.asarray(info["actions"]), int(info["age"])
         if obs.shape != (self.spec.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.spec.obs_size}; got shape {obs.shape}")
