@@ -143,6 +143,22 @@ def test_runs_on_the_command_line(vdpo: Run, tmp_path: Path, capsys: pytest.Capt
     assert (part["agent"], part["step"], part["steps"]) == ("random", 100, 200)
 
 
+def test_a_run_of_another_format_hides_no_other(vdpo: Run, tmp_path: Path, capsys) -> None:
+    for name, format in (("a", 2), ("b", 1)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(json.dumps(vdpo.config | {"format": format}))
+        (tmp_path / name / "rows.jsonl").write_text((vdpo.path / "rows.jsonl").read_text())
+    line = f"{tmp_path / 'a' / 'config.json'} has format 2; this version reads 1"
+    main(["runs", str(tmp_path)])
+    _, other, good = capsys.readouterr().out.splitlines()
+    assert other.split(maxsplit=7) == [*"-------", line]
+    assert (good.split()[0], good.split()[-1]) == ("vdpo", str(tmp_path / "b"))
+    main(["runs", str(tmp_path), "--json"])
+    other, good = json.loads(capsys.readouterr().out)
+    assert (other["run"], other["error"], other["return"]) == (str(tmp_path / "a"), line, None)
+    assert (good["run"], good["error"], good["step"]) == (str(tmp_path / "b"), None, 300)
+
+
 def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Options that differ, by name; intervals where there are seeds; a picture."""
     train("random", tmp_path / "two", steps=200, random_steps=100, seeds=2)
@@ -170,4 +186,11 @@ def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_compare_says_what_a_run_began_from() -> None:
     origin = {"agent": "bpql", "env": "Walk", "delay": 2, "seed": 0, "step": 400, "networks": 5 * "d2e63b2c5ccd"}
     (row,) = differences([{"agent": "bpql"}, {"agent": "bpql", "origin": {"from": origin}}])
-    assert row == ["from", "-", "agent bpql, env Walk, delay 2, seed 0, step 400, networks d2e63b2c5ccd"]
+    assert row == ["from", "-", "bpql at step 400, d2e63b2c"]
+
+
+def test_compare_draws_what_it_can(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Another kind of file is refused before anything is printed."""
+    with pytest.raises(SystemExit):
+        main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "cmp.xyz")])
+    assert capsys.readouterr() == ("", f"delayrl: --out must end in .png, .pdf or .svg; got {tmp_path / 'cmp.xyz'}\n")
