@@ -10,13 +10,17 @@ from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper
-from delayrl.envs.task import TaskLike, WrapperLike, as_task
+from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task
+from delayrl.errors import DelayRLError, near_names
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.single import check_length
 from delayrl.wrappers.single import check_limit as check_limit
 from delayrl.wrappers.single import name_of as name_of
 from delayrl.wrappers.single import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
+
+OPTIONS = ("env_kwargs", "wrappers", "flatten", "normalise", "rescale", "history", "fill")
+"""Of `make` itself. All others are keyword arguments of what makes the environment."""
 
 
 def make(
@@ -53,7 +57,7 @@ def make(
             is that of its error), unsuitable spaces, a bad delay.
     """
     named = as_task(env, env_kwargs, wrappers, flatten)
-    task: Any = named.make(**options)
+    task: Any = _made(named, options)
     check_spaces(str(named), task.observation_space, task.action_space)
     if normalise:
         task = NormalizeObservation(task)
@@ -63,6 +67,16 @@ def make(
         idle = 2 * (np.clip(0, low, high) - low) / (high - low) - 1
         task = RescaleAction(task, np.float32(-1), np.float32(1))
     return Delayed(task, delay, history, fill, idle)
+
+
+def _made(task: Task, options: dict[str, Any]) -> Any:
+    try:
+        return task.make(**options)
+    except DelayRLError as error:
+        near = [ours for name in options for ours in near_names(name, OPTIONS)]
+        if near and isinstance(error.__cause__, TypeError):
+            raise DelayRLError(f"{error}; did you mean {', '.join(near)}?") from error.__cause__
+        raise
 
 
 def delay_of(env: TaskLike, delay: DelayLike) -> Delay:

@@ -113,10 +113,10 @@ def servable(env: TaskLike, delay: DelayLike, spec: Spec) -> Delay:
 
 def check_fits(env: Any, spec: Spec) -> None:
     """Raise DelayRLError if observations or actions of a task have other sizes than those of a policy."""
-    wanted, found = ((one.obs_size, one.action_size) for one in (spec, spec_of(env)))
-    if wanted != found:
-        line = "the policy takes observations of size {} and gives actions of size {}".format(*wanted)
-        raise DelayRLError("{}; {} has sizes {} and {}".format(line, name_of(env), *found))
+    own = spec_of(env)
+    if (own.obs_size, own.action_size) != (spec.obs_size, spec.action_size):
+        line = f"the policy takes observations of size {spec.obs_size} and gives actions of size {spec.action_size}"
+        raise DelayRLError(f"{line}; {name_of(env)} has sizes {own.obs_size} and {own.action_size}")
 
 
 @functools.cache

@@ -89,7 +89,7 @@ def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) 
     known = [option.name for config in configs for option in options(config)] + list(also)
     for name in values:
         if name not in known:
-            near = near_names(name, known)
+            near = near_names(name, [*known, "start_from"])  # an option of `train` alone
             hint = f"did you mean {', '.join(near)}?" if near else "`delayrl train AGENT --help` lists them"
             raise DelayRLError(f"unknown hyperparameter {name!r}; {hint}")
 
