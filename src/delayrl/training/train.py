@@ -76,7 +76,7 @@ def train(
         preset: "paper", "matched" or "small": which hyperparameters to start from (docs/cli.md).
         seed: fixes everything: environments, networks, sampling.
         seeds: trains the seeds seed .. seed + seeds - 1 in lockstep, or those of a list.
-        out: the run folder; with several seeds the folder of their run folders.
+        out: the run folder of one seed, of a list of one too; of several seeds the folder of their run folders.
         device: "cpu" or "gpu"; None leaves the choice to JAX.
         overwrite: start afresh where a run exists.
         protocol: "corrected", or "official": the released code's habits (docs/concepts.md).
