@@ -28,7 +28,7 @@ def make(
     delay: DelayLike = 0,
     *,
     env_kwargs: Mapping[str, Any] | None = None,
-    wrappers: Sequence[WrapperLike] = (),
+    wrappers: WrapperLike | Sequence[WrapperLike] = (),
     flatten: bool = False,
     normalise: bool = False,
     rescale: bool = False,
@@ -43,7 +43,8 @@ def make(
             that makes an environment.
         delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; no longer than an episode.
         env_kwargs: keyword arguments for what makes the environment, e.g. {"gain": 2}.
-        wrappers: between the environment and the delay, innermost first: classes, or names such as "filters:LowPass".
+        wrappers: one or several between the environment and the delay, innermost first: classes, or names such as
+            "filters:LowPass".
         flatten: join nested observations (Dict, Tuple, images) to one vector.
         normalise: show deviations from a running mean, in units of the running standard deviation. Both belong to this
             environment; an agent keeps its own (`observation_norm`), and is trained on the task as it is.
