@@ -1,5 +1,6 @@
 """Tasks such as users bring: a class, functions, wrappers, and modules in a folder of their own."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,22 @@ class Camera(gym.ObservationWrapper):
 
 def make_arm(**kwargs: Any) -> gym.Env:
     return TimeLimit(Arm(**kwargs), 20)
+
+
+def failing(method: str) -> Callable[[], gym.Env]:
+    """A function that makes an environment whose `reset` or `step` divides by zero, `step` at its third call."""
+
+    class Failing(Arm):
+        calls = 0
+
+        def reset(self, **options: Any) -> Any:
+            return super().reset(**options) if method != "reset" else 1 / 0
+
+        def step(self, action: np.ndarray) -> Any:
+            self.calls += 1
+            return super().step(action) if self.calls < 3 else 1 / 0
+
+    return lambda: TimeLimit(Failing(), 20)
 
 
 LIMIT = "gymnasium.wrappers:TimeLimit(max_episode_steps=20)"

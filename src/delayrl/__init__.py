@@ -14,13 +14,16 @@ if TYPE_CHECKING:
     from delayrl.agents.registry import AGENTS as AGENTS
     from delayrl.delays import Delay as Delay
     from delayrl.delays import as_delay as as_delay
+    from delayrl.deploy.export import export_run as export_run
     from delayrl.envs import make as make
     from delayrl.errors import DelayRLError as DelayRLError
     from delayrl.play.evaluation import evaluate as evaluate
+    from delayrl.play.evaluation import sweep as sweep
     from delayrl.play.policy import Policy as Policy
     from delayrl.play.policy import load as load
     from delayrl.play.run import Run as Run
     from delayrl.play.run import runs as runs
+    from delayrl.play.video import watch as watch
     from delayrl.training.further import go_on as go_on
     from delayrl.training.train import train as train
     from delayrl.wrappers import AugmentedObservation as AugmentedObservation
@@ -42,11 +45,14 @@ _HOME = {
     "Policy": "play.policy",
     "Run": "play.run",
     "evaluate": "play.evaluation",
+    "export_run": "deploy.export",
     "load": "play.policy",
     "make": "envs",
     "runs": "play.run",
+    "sweep": "play.evaluation",
     "go_on": "training.further",
     "train": "training.train",
+    "watch": "play.video",
 }
 __all__ = sorted(_HOME)
 

@@ -36,8 +36,12 @@ ELSEWHERE = {
     "buffer_size": "replay_capacity",
     "learning_starts": "random_steps",
     "total_timesteps": "steps",
+    "normalise": "observation_norm",
+    "normalize": "observation_norm",
+    "from": "start_from",
+    "from_": "start_from",
 }
-"""Options of other libraries, and what they are called here."""
+"""Options of other libraries and functions, and what they are called here."""
 
 
 def near_names(name: str, known: Iterable[str]) -> list[str]:

@@ -35,6 +35,9 @@ def find_object(name: str) -> Any:
 
 def find_module(source: str) -> ModuleType:
     """Import a module, which may lie in the working folder, as with `python -m`. Raises DelayRLError if that fails."""
+    if "/" in source or source.endswith(".py"):
+        name = source.removeprefix("./").removesuffix(".py").replace("/", ".")
+        raise DelayRLError(f"a module is named as in an import, such as {name}; got {source!r}")
     _search_working_folder()
     with one_line(f"cannot import {source!r}"):
         return importlib.import_module(source)
@@ -78,12 +81,19 @@ def public_name(name: str, group: str) -> str:
     return next((short for short, source in entry_points(group).items() if source == name), name)
 
 
-def came_with(name: str, folder: Path) -> bool:
-    """Return whether the module of `module:object` lies in or beside a run folder. Imports nothing."""
+def is_unsafe(name: str, folder: Path) -> bool:
+    """Return whether a run folder may not name the module of `module:object`. Imports nothing.
+
+    It may not if the module lies in or beside the folder, or is Python's own: these hold nothing that a run needs, and
+    some act when they are imported.
+    """
     _search_working_folder()
     source = name.partition(":")[0]
+    package = source.partition(".")[0]
+    if package in sys.stdlib_module_names:
+        return True
     with one_line(f"cannot import {source!r}"):
-        spec = importlib.util.find_spec(source.partition(".")[0])  # of the package
+        spec = importlib.util.find_spec(package)
     places = [spec.origin or "", *(spec.submodule_search_locations or [])] if spec is not None else []
     return any(Path(place).resolve().is_relative_to(top) for place in places for top in _tops(folder))
 

@@ -154,7 +154,7 @@ def test_code_that_came_with_a_run_is_not_imported(tmp_path: Path, monkeypatch) 
         with pytest.raises(DelayRLError, match=r"came with a law of delays that could run any code, runs.evil:Burst"):
             stored_delay(text, folder)
     for text in (f'os:mkdir(path="{witness}")', f'pathlib:Path.touch(self="{witness}")'):
-        with pytest.raises(DelayRLError, match="is no law of delays"):
+        with pytest.raises(DelayRLError, match="came with a law of delays that could run any code"):
             stored_delay(text, folder)
     assert not witness.exists()
     assert delayrl.make(make_arm, "runs.evil:Burst").delay.maximum == 3  # whoever names it means it

@@ -131,6 +131,17 @@ def test_wrappers_and_flat_observations() -> None:
     assert ends == [False] * 19 + [True]
 
 
+def test_one_wrapper_needs_no_list() -> None:
+    assert as_task(Arm, wrappers=Camera) == as_task(Arm, wrappers=[Camera]) == as_task(Arm, wrappers="own_tasks:Camera")
+
+
+def test_an_option_of_make_in_other_letters() -> None:
+    line = r"TypeError: .*unexpected keyword argument 'normalize'; did you mean normalise\?$"
+    with pytest.raises(DelayRLError, match=line) as error:
+        delayrl.make(Arm, 1, normalize=True)
+    assert isinstance(error.value.__cause__, TypeError)
+
+
 def test_normalised_observations() -> None:
     """As Gymnasium's wrapper between task and delay, outside of flattening; its moments can be read and stopped."""
     ours = delayrl.make(Arm, 2, wrappers=[LIMIT, Camera], flatten=True, normalise=True)
@@ -207,6 +218,8 @@ def test_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         ("my_raising:Arm", "cannot import 'my_raising': ZeroDivisionError: division by zero"),
         ("my_raising:Arm-v0", "cannot import 'my_raising': ZeroDivisionError: division by zero"),
         ("my_ending:Arm", "cannot import 'my_ending': SystemExit: 3"),
+        ("my_arm.py:make", "a module is named as in an import, such as my_arm; got 'my_arm.py'"),
+        ("./my_arm.py:make", "a module is named as in an import, such as my_arm; got './my_arm.py'"),
         ("not_there:Arm", "cannot import 'not_there': ModuleNotFoundError: No module named 'not_there'"),
         (":Arm", "cannot import ''"),
         ("my_registered:My-v0", "task 'my_registered:My-v0' cannot be made here: OSError: no such robot"),
@@ -267,10 +280,13 @@ def test_what_a_run_folder_may_name(tmp_path: Path, monkeypatch) -> None:
         f'pathlib:Path.touch(self="{witness}")',
         f"Pendulum-v1 | numpy:savetxt(X=[1], fname='{witness}')".replace("'", '"'),
         "gymnasium:make",
+        "antigravity:fly_to",
+        "idlelib.idle:idlelib",  # importing these two opens windows
     ):
         with pytest.raises(DelayRLError, match=r"came with a task that could run any code, .*give it as env"):
             stored_task(text, folder)
     assert not witness.exists()
+    assert not {"antigravity", "idlelib.idle"} & sys.modules.keys()
 
 
 @pytest.mark.parametrize("name", ["runs.evil", "runs.mine.evil", "evil"])

@@ -13,6 +13,7 @@ from delayrl.core.types import Seen, Spec
 from delayrl.envs import make
 from delayrl.play.evaluation import EVALUATION, HELD_OUT, RANDOM_ACTIONS, TRAINING, Evaluator, evaluate, reset_seed
 from delayrl.play.run import Run
+from own_tasks import failing
 
 
 def test_any_shorter_delay(vdpo: Run) -> None:
@@ -64,6 +65,21 @@ def test_episodes_by_hand() -> None:
                 total += env.step(action)[1]
             np.testing.assert_allclose(played.returns[i, j], total, rtol=1e-5)
     assert (played.lengths == 50).all()
+
+
+def test_what_cannot_be_played(vdpo: Run) -> None:
+    """A task of other sizes, half an episode, a seed that is none, and an environment that fails."""
+    line = "the policy takes observations of size 10 and gives actions of size 2; Pendulum-v1 has sizes 3 and 1"
+    with pytest.raises(delayrl.DelayRLError, match=f"^{line}$"):
+        evaluate(vdpo.policy(), 2, env="Pendulum-v1")
+    with pytest.raises(delayrl.DelayRLError, match=r"^episodes must be a whole number, at least 1; got 2\.5$"):
+        evaluate(vdpo, 2.5)  # type: ignore[arg-type]
+    with pytest.raises(delayrl.DelayRLError, match=r"^a seed must be a whole number from 0 to 2147483647; got 1\.5$"):
+        evaluate(vdpo, seed=1.5)  # type: ignore[arg-type]
+    for method in ("reset", "step"):
+        evaluator = Evaluator(Shaky(), Spec(1, 1, 1), failing(method), 1, 1, 1)  # type: ignore[arg-type]
+        with pytest.raises(delayrl.DelayRLError, match=f"^Failing failed in {method}: ZeroDivisionError: .*own_tasks"):
+            evaluator(jnp.zeros(1), [[1]], jax.random.key(0)[None])
 
 
 def test_late_rewards_change_no_return() -> None:

@@ -12,13 +12,17 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 import delayrl.play.video as video
+from delayrl.delays import as_delay
 from delayrl.envs import make
+from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import HELD_OUT, reset_seed
 from delayrl.play.picture import GAP, aim, beside, caption, moving_base
 from delayrl.play.video import Moment, _episode, _few_colours, _repeated, _together
+from own_tasks import Arm, failing
 
 STILL = SimpleNamespace(act=lambda obs, info: np.zeros_like(info["actions"][0]))
 SIZE = (480, 480, 3)
@@ -247,6 +251,46 @@ def test_frames_of_a_gif_share_their_colours() -> None:
 def test_a_length_of_nothing(tmp_path: Path, seconds: float) -> None:
     with pytest.raises(DelayRLError, match="--seconds is a length above 0, such as 8; got"):
         video.watch(tmp_path, tmp_path / "x.gif", seconds=seconds)
+
+
+@pytest.mark.parametrize("rate", [30 / 2, 125 / 8, 50 / 3, 22.0, 60.0])
+def test_frames_of_a_gif_take_their_time(tmp_path: Path, rate: float) -> None:
+    """Each is whole hundredths of a second, and all of them together are as long as they should be."""
+    halves = np.repeat(np.array([0, 200], np.uint8), 4)[:, None, None] * np.ones((8, 8, 3), np.uint8)
+    with video._video(tmp_path / "x.gif", rate) as add:
+        for frame in range(41):
+            add(np.roll(halves, 4 * frame, axis=0))
+    with Image.open(tmp_path / "x.gif") as file:
+        times = [frame.info["duration"] for frame in ImageSequence.Iterator(file)]
+    assert len(times) == 41
+    np.testing.assert_allclose(np.cumsum(times), 1000 * np.arange(1, 42) / rate, atol=5 + 1e-9)
+    with video._video(tmp_path / "one.gif", rate) as add:
+        add(halves)
+    assert (tmp_path / "one.gif").stat().st_size > 0
+
+
+def test_titles_of_two_runs_differ() -> None:
+    paths = [Path("runs/a/bpql-small/seed0"), Path("runs/a/bpql-paper/seed0")]
+    named = ["bpql, delay 3, bpql-small/seed0", "bpql, delay 3, bpql-paper/seed0"]
+    assert video._apart(["bpql, delay 3"] * 2, paths) == named
+    assert video._apart(["bpql, delay 3", "bpql, delay 2"], paths) == ["bpql, delay 3", "bpql, delay 2"]
+    assert video._apart(["bpql, delay 3"] * 2, [paths[0]] * 2) == ["bpql, delay 3"] * 2
+
+
+def test_a_task_without_render_mode() -> None:
+    line = "a video needs an environment that takes render_mode, and own_tasks:Arm does not: docs/own-task.md shows one"
+    with pytest.raises(DelayRLError, match=f"^{line}$"):
+        video._rendering(as_task(Arm), as_delay(1))
+
+
+@pytest.mark.parametrize("method", ["reset", "step"])
+def test_an_environment_that_fails_is_not_blamed_on_rendering(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "render", lambda env: np.zeros(SIZE, np.uint8))
+    env = make(failing(method), 1)
+    line = rf"^Failing failed in {method}: ZeroDivisionError: division by zero \(own_tasks.py, line \d+\)$"
+    with pytest.raises(DelayRLError, match=line) as error:
+        list(_episode(env, STILL, 5, None, 4, 1))
+    assert isinstance(error.value.__cause__, ZeroDivisionError)
 
 
 def test_a_renderer_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:

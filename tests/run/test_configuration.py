@@ -1,7 +1,10 @@
 """Options of dataclasses: named, checked, rebuilt."""
 
+import pytest
+
 from delayrl.agents.registry import AGENTS
-from delayrl.run.configuration import override, values_of
+from delayrl.errors import DelayRLError
+from delayrl.run.configuration import OLDER, override, values_of
 
 
 def test_options_round_trip() -> None:
@@ -9,3 +12,13 @@ def test_options_round_trip() -> None:
     for entry in AGENTS.values():
         for preset in entry.presets.values():
             assert override(preset.agent, values_of(preset.agent)) == preset.agent
+
+
+def test_older_runs_of_every_preset() -> None:
+    """What an option means where a configuration does not mention it is allowed, whatever the preset's own value."""
+    for entry in AGENTS.values():
+        for preset in entry.presets.values():
+            older = {name: value for name, value in OLDER.items() if name in values_of(preset.agent)}
+            assert values_of(override(preset.agent, OLDER)) == values_of(preset.agent) | older
+    with pytest.raises(DelayRLError, match=r"^tokens must lie in 0 \.\. inf; got -1$"):
+        override(AGENTS["vdpo"].presets["small"].agent, {"tokens": -1})

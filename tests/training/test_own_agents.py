@@ -189,6 +189,22 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
     assert any(line.startswith("shrink ") and "Shrinks its actor" in line for line in lines)
     with pytest.raises(DelayRLError, match="unknown agent 'shrnik'; did you mean shrink"):
         find_agent("shrnik")
+    line = "unknown agent 'nowhere'; `delayrl agents` lists them; one of your own is MODULE:NAME, and a run is named by"
+    with pytest.raises(DelayRLError, match=f"^{line} its folder$"):
+        find_agent("nowhere")
+    with pytest.raises(DelayRLError, match=r"^an agent is a name .*, MODULE:NAME, a class or an instance; got None$"):
+        as_agent(None)  # type: ignore[arg-type]
+    (tmp_path / "shrink").mkdir()
+    (tmp_path / "runs").mkdir()
+    monkeypatch.chdir(tmp_path)
+    for word, line in (
+        ("shrink", "--env"),  # the agent, although there is a folder
+        ("./own_agents.py:Shrink", "a module is named as in an import, such as own_agents; got './own_agents.py'"),
+        ("./runs", "there is no run folder ./runs; `delayrl runs` lists the runs below runs/"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["train", word])
+        assert line in capsys.readouterr().err
     config = resolve("shrink", make_arm, 3, "small", "corrected", {"width": 3}).config
     assert overrides_of(json.loads(json.dumps(config))) == {"width": 3}
 

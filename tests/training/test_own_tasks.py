@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import delayrl
 from delayrl.bench.grid import load_grid
@@ -19,6 +20,7 @@ from delayrl.deploy import load_bundle
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import evaluate
 from delayrl.run.condition import resolve
+from delayrl.run.folder import RunFolder
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
 from short_runs import arrays, killed_and_resumed, train
 
@@ -47,7 +49,7 @@ def test_a_run_names_its_task(tmp_path: Path) -> None:
     result = evaluate(run.path, 2)
     assert result["env"] == text
     assert evaluate(run.path, 2, env_kwargs={"gain": 0})["returns"] != result["returns"]
-    run.create(run.config | {"env": "own_tasks:Arm"})
+    RunFolder(run.path).create(run.config | {"env": "own_tasks:Arm"})
     with pytest.raises(DelayRLError, match=r"own_tasks:Arm has no time limit.*behind a \| in the task"):
         evaluate(run, 2)
     assert evaluate(run, 2, env=text)["returns"] == result["returns"]
@@ -179,4 +181,13 @@ def test_the_page_on_own_tasks(tmp_path: Path, monkeypatch) -> None:
         "arm-make-gain=0.2-delay4",
         "lambda-gain=0.2-delay4",
     }
-    sys.modules.pop("arm")
+    delayrl.watch(Path("runs/arm-make-gain=0.2-delay4/bpql-small/seed0"), "arm.gif")
+    with Image.open("arm.gif") as file:
+        assert (file.size, file.n_frames > 30) == ((240, 240), True)
+    arm = sys.modules.pop("arm").Arm(render_mode="rgb_array")
+    for angle, end in ((0, (25, 120)), (np.pi / 2, (120, 215)), (-np.pi / 2, (120, 25))):
+        arm.angle = np.array([angle])
+        black = arm.render()[..., 0] == 0
+        assert [bool(black[at]) for at in ((25, 120), (120, 215), (120, 25))] == [
+            at == end for at in ((25, 120), (120, 215), (120, 25))
+        ]

@@ -20,9 +20,40 @@ def test_curves_are_those_of_the_rows(vdpo: Run) -> None:
         assert steps.tolist() == [100, 200, 300]
         rows = [row for row in vdpo.rows() if row["policy"] == policy]
         np.testing.assert_array_equal(returns, np.reshape([row["return"] for row in rows], (3, 2)))
-    nothing = delayrl.Run("nowhere").curve()
-    assert nothing.returns.shape == (0, 0)
-    assert len(nothing.steps) == 0
+    with pytest.raises(delayrl.DelayRLError, match=r"^a curve is that of \"agent\" or \"reference\"; got 'refrence'$"):
+        vdpo.curve("refrence")
+
+
+def test_a_curve_leaves_out_what_a_crash_cut(vdpo: Run, tmp_path: Path) -> None:
+    """An evaluation with fewer episodes than the others, and the half of a line."""
+    kept = [row for row in vdpo.rows() if row["policy"] == "agent"]
+    text = "".join(json.dumps(row) + "\n" for row in kept)
+    (tmp_path / "config.json").write_text(json.dumps(vdpo.config))
+    (tmp_path / "rows.jsonl").write_text(text[:-9])
+    steps, returns = delayrl.Run(tmp_path).curve()
+    assert steps.tolist() == [100, 200]
+    np.testing.assert_array_equal(returns, np.reshape([row["return"] for row in kept[:4]], (2, 2)))
+    (tmp_path / "rows.jsonl").write_text("")
+    nothing = delayrl.Run(tmp_path).curve()
+    assert (nothing.steps.shape, nothing.returns.shape) == ((0,), (0, 0))
+
+
+def test_what_is_no_run(vdpo: Run, tmp_path: Path) -> None:
+    """Folders without a configuration, the folder of several seeds, and what is no folder at all."""
+    for read in (Run.rows, Run.metrics, Run.episodes, Run.curve):
+        with pytest.raises(delayrl.DelayRLError, match=r"^nowhere is not a run folder: it has no config.json$"):
+            read(delayrl.Run("nowhere"))
+    for seed in (10, 3):
+        (tmp_path / f"seed{seed}").mkdir()
+        (tmp_path / f"seed{seed}" / "config.json").write_text(json.dumps(vdpo.config))
+    for use in (delayrl.evaluate, delayrl.load, lambda run: delayrl.train("bpql", "Reacher-v5", 3, start_from=run)):
+        with pytest.raises(delayrl.DelayRLError) as error:
+            use(tmp_path)
+        assert str(error.value).endswith(f"config.json; its runs are {tmp_path / 'seed3'}, {tmp_path / 'seed10'}")
+    for use in (delayrl.Run, delayrl.load, delayrl.evaluate):
+        for thing, got in (([vdpo, vdpo], "this is a list of runs"), (3, "got 3"), (None, "got None")):
+            with pytest.raises(delayrl.DelayRLError, match=f"^give one run, or the path of its folder; {got}$"):
+                use(thing)
 
 
 def test_episodes_of_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,6 +143,22 @@ def test_runs_on_the_command_line(vdpo: Run, tmp_path: Path, capsys: pytest.Capt
     assert (part["agent"], part["step"], part["steps"]) == ("random", 100, 200)
 
 
+def test_a_run_of_another_format_hides_no_other(vdpo: Run, tmp_path: Path, capsys) -> None:
+    for name, format in (("a", 2), ("b", 1)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(json.dumps(vdpo.config | {"format": format}))
+        (tmp_path / name / "rows.jsonl").write_text((vdpo.path / "rows.jsonl").read_text())
+    line = f"{tmp_path / 'a' / 'config.json'} has format 2; this version reads 1"
+    main(["runs", str(tmp_path)])
+    _, other, good = capsys.readouterr().out.splitlines()
+    assert other.split(maxsplit=7) == [*"-------", line]
+    assert (good.split()[0], good.split()[-1]) == ("vdpo", str(tmp_path / "b"))
+    main(["runs", str(tmp_path), "--json"])
+    other, good = json.loads(capsys.readouterr().out)
+    assert (other["run"], other["error"], other["return"]) == (str(tmp_path / "a"), line, None)
+    assert (good["run"], good["error"], good["step"]) == (str(tmp_path / "b"), None, 300)
+
+
 def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Options that differ, by name; intervals where there are seeds; a picture."""
     train("random", tmp_path / "two", steps=200, random_steps=100, seeds=2)
@@ -139,4 +186,11 @@ def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_compare_says_what_a_run_began_from() -> None:
     origin = {"agent": "bpql", "env": "Walk", "delay": 2, "seed": 0, "step": 400, "networks": 5 * "d2e63b2c5ccd"}
     (row,) = differences([{"agent": "bpql"}, {"agent": "bpql", "origin": {"from": origin}}])
-    assert row == ["from", "-", "agent bpql, env Walk, delay 2, seed 0, step 400, networks d2e63b2c5ccd"]
+    assert row == ["from", "-", "bpql at step 400, d2e63b2c"]
+
+
+def test_compare_draws_what_it_can(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Another kind of file is refused before anything is printed."""
+    with pytest.raises(SystemExit):
+        main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "cmp.xyz")])
+    assert capsys.readouterr() == ("", f"delayrl: --out must end in .png, .pdf or .svg; got {tmp_path / 'cmp.xyz'}\n")

@@ -17,6 +17,8 @@ from delayrl.run.condition import resolve
 from delayrl.training.actor import Actor
 from delayrl.training.checks import check_fit
 from delayrl.training.learner import Program
+from delayrl.training.seeds import seed_numbers
+from own_tasks import failing
 from short_runs import arrays, newest, train
 
 
@@ -252,6 +254,8 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
     [
         ({"preset": "huge"}, "unknown preset"),
         ({"widht": 3}, "did you mean width"),
+        ({"normalise": True}, "unknown hyperparameter 'normalise'; did you mean observation_norm"),
+        ({"from_": "run"}, "unknown hyperparameter 'from_'; did you mean start_from"),
         ({"lr": 3}, "unknown hyperparameter 'lr'; did you mean learning_rate, actor_learning_rate, critic_"),
         ({"xyz": 3}, "unknown hyperparameter 'xyz'; `delayrl train AGENT --help` lists them"),
         ({"batch_size": 0}, "at least 1"),
@@ -262,7 +266,10 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"seed": -1}, "seed"),
         ({"seeds": []}, "a list of different seeds"),
         ({"seeds": [1, 1]}, "a list of different seeds"),
-        ({"seeds": [0.5]}, "a list of different seeds"),
+        ({"seeds": [0.5]}, "a seed must be a whole number from 0 to 2147483647; got 0.5"),
+        ({"seeds": 2.0}, "a list of different seeds without seed=; got 2.0"),
+        ({"seed": 1.5}, "a seed must be a whole number from 0 to 2147483647; got 1.5"),
+        ({"seed": "0"}, "a seed must be a whole number from 0 to 2147483647; got '0'"),
         ({"seeds": [0, 1], "seed": 3}, "without seed="),
         ({"seeds": [0, -1]}, "a seed must be"),
         ({"seeds": 0}, "seeds must be at least 1"),
@@ -294,6 +301,20 @@ def test_a_run_learns_something(steps: int, every: int, fits: bool) -> None:
     check_fit(resolve("random", "Reacher-v5", 3, "small", "corrected", {"steps": steps}), task)  # never learns
     with pytest.raises(delayrl.DelayRLError, match=r"step 5,000, .* fewer random_steps, or preset small$"):
         check_fit(resolve("a-sac", "Reacher-v5", 3, "paper", "corrected", {"steps": 1500}), task)
+
+
+@pytest.mark.parametrize("method", ["reset", "step"])
+def test_an_environment_that_fails(method: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        delayrl.DelayRLError, match=f"^Failing failed in {method}: ZeroDivisionError: .*own_tasks.py, line"
+    ):
+        train("random", tmp_path / "run", env=failing(method))
+
+
+def test_seeds_of_numpy() -> None:
+    assert seed_numbers(0, np.int64(2)) == [0, 1]
+    assert seed_numbers(0, np.arange(3).tolist()) == [0, 1, 2]
+    assert {type(number) for number in seed_numbers(np.int64(4), np.int64(2))} == {int}
 
 
 def test_unknown_agent() -> None:

@@ -16,6 +16,7 @@ SCHEDULE = {"preset": "small", "steps": 150, "random_steps": 50, "evaluate_every
 point(1, "a task of one's own, on the command line")
 typed(f"delayrl train random --env arm:make --env-kwargs gain=0.2 --delay 80ms --out own {SHORT}", "arm:make(gain=0.2)")
 typed("delayrl evaluate own --episodes 2", "random on arm:make(gain=0.2), delay 4")
+typed("delayrl watch own --out own.gif", "own.gif: 100 steps")
 typed("delayrl evaluate own --episodes 2 --env-kwargs gain=.3", "arm:make(gain=0.3)")
 typed(
     f"delayrl evaluate own --episodes 2 --env 'arm:Arm | {LIMIT}'", "arm:Arm(gain=0.2) | gymnasium.wrappers:TimeLimit"

@@ -9,6 +9,7 @@ Views: the reference sees s_t, the delayed policy x_t. Privileged in training (r
 Deviations from the paper and from the released code are numbered in docs/algorithms/vdpo.md.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -70,7 +71,9 @@ class VDPO:
         Behaviour,
         "who acts in training: delayed, reference, mixture (a coin flip), or lower-q (the one with the lower Q)",
     ] = "lower-q"
-    tokens: Annotated[int, "most hidden states in an update of belief or cloning; 0: those of a whole batch"] = 0
+    tokens: Annotated[
+        int, "most hidden states in an update of belief or cloning; 0: those of a whole batch", (0, math.inf)
+    ] = 0
     at_age_0: Annotated[Current, "the delayed policy's action in training where nothing is hidden"] = "reference"
 
     @property

@@ -28,6 +28,8 @@ def run(given: argparse.Namespace) -> None:
 
     if not 2 <= len(given.runs) <= len(LABELS):
         raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")
+    if given.out.suffix not in (".png", ".pdf", ".svg"):
+        raise DelayRLError(f"--out must end in .png, .pdf or .svg; got {given.out}")
     groups = [seed_runs(path) for path in given.runs]
     configs = [group[0].config for group in groups]
     labels = LABELS[: len(groups)]
@@ -67,8 +69,7 @@ def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
             if name not in ABOUT:
                 own |= value if isinstance(value, dict) else {name: value}
         if origin := own.get("from"):
-            origin = {**origin, "networks": str(origin.get("networks"))[:12]}  # of a hash
-            own["from"] = ", ".join(f"{name} {value}" for name, value in origin.items())
+            own["from"] = f"{origin.get('agent')} at step {origin.get('step')}, {str(origin.get('networks'))[:8]}"
     names = dict.fromkeys(name for own in options for name in own)
     rows = [[name, *(own.get(name, "-") for own in options)] for name in names]
     return [row for row in rows if any(value != row[1] for value in row[2:])]

@@ -3,8 +3,13 @@
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from delayrl.cli.console import print_table
+from delayrl.errors import DelayRLError
+from delayrl.play.run import Run
+
+NAMES = ("agent", "preset", "env", "delay", "seed")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -14,30 +19,35 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Print what each run trains, how far it is, and its last return."""
+    """Print what each run trains, how far it is, and its last return; of one that cannot be read why."""
     from delayrl.play.run import runs
 
-    names = ("agent", "preset", "env", "delay", "seed")
-    rows = []
-    for one in runs(given.folder):
-        config, curve = one.config, one.curve()
-        done, steps = (int(curve.steps[-1]) if len(curve.steps) else 0), config["schedule"].get("steps", 0)
-        last = float(curve.returns[-1].mean()) if done else None
-        columns = {name: config.get(name) for name in names}
-        rows.append({**columns, "step": done, "steps": steps, "return": last, "run": str(one.path)})
+    rows = [_row(one) for one in runs(given.folder)]
     if given.json:
         print(json.dumps(rows))
         return
     if not rows:
         print(f"no runs in {given.folder}; `delayrl train` makes one")
         return
-    table = [
-        [
-            *(row[name] for name in names),
-            f"{row['step']:,}" if row["step"] >= row["steps"] else f"{row['step']:,} of {row['steps']:,}",
-            "-" if row["return"] is None else f"{row['return']:,.1f}",
-            row["run"],
-        ]
-        for row in rows
-    ]
-    print_table([*names, "steps", "return", "run"], table)
+    print_table([*NAMES, "steps", "return", "run"], [_cells(row) for row in rows])
+
+
+def _row(run: Run) -> dict[str, Any]:
+    """Return the columns of a run; `error` is the line that says why it cannot be read."""
+    row: dict[str, Any] = dict.fromkeys((*NAMES, "step", "steps", "return")) | {"run": str(run.path), "error": None}
+    try:
+        config, curve = run.config, run.curve()
+    except DelayRLError as error:
+        return row | {"error": str(error)}
+    step = int(curve.steps[-1]) if len(curve.steps) else 0
+    last = float(curve.returns[-1].mean()) if step else None
+    columns = {name: config.get(name) for name in NAMES}
+    return row | columns | {"step": step, "steps": config["schedule"].get("steps", 0), "return": last}
+
+
+def _cells(row: dict[str, Any]) -> list[Any]:
+    if row["error"]:
+        return [*["-"] * (len(NAMES) + 2), row["error"]]  # which names the folder
+    steps = f"{row['step']:,}" if row["step"] >= row["steps"] else f"{row['step']:,} of {row['steps']:,}"
+    last = "-" if row["return"] is None else f"{row['return']:,.1f}"
+    return [*(row[name] for name in NAMES), steps, last, row["run"]]

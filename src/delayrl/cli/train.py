@@ -9,12 +9,12 @@ from delayrl.cli import agents
 from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored, add_wrappers, whole
 from delayrl.errors import DelayRLError
 from delayrl.play.run import Run
+from delayrl.run.folder import seed_folders
 
 
 def add_options(parser: Parser, words: Sequence[str]) -> None:
     """Add the options of the agent that comes first in `words`, with the defaults of their preset."""
-    from delayrl.agents.registry import AGENTS
-    from delayrl.run.agents import find_agent
+    from delayrl.run.agents import agent_names, find_agent
 
     if not words or words[0].startswith("-"):
         if {"-h", "--help"} & set(words):
@@ -23,10 +23,10 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
             agents.run()
             parser.exit()
         raise DelayRLError("name the agent first, e.g. `delayrl train vdpo`; `delayrl agents` lists them")
-    if words[0] not in AGENTS and Path(words[0]).is_dir():
+    if seed_folders(words[0])[0].exists and words[0] not in agent_names():
         _add_options_of_a_run(parser, words[0])
         return
-    if "/" in words[0]:
+    if "/" in words[0] and ":" not in words[0]:
         raise DelayRLError(f"there is no run folder {words[0]}; `delayrl runs` lists the runs below runs/")
     agent = find_agent(words[0])
     parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary

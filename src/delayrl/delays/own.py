@@ -14,9 +14,9 @@ import numpy as np
 from delayrl.delays.laws import whole_steps
 from delayrl.errors import DelayRLError
 from delayrl.lookup import (
-    came_with,
     entry_points,
     find_object,
+    is_unsafe,
     name_of_object,
     one_line,
     parse_arguments,
@@ -114,7 +114,7 @@ def find_law(text: str, stored: Path | None = None) -> OwnLaw | None:
     source = match and (match[1] if ":" in match[1] else entry_points(GROUP).get(match[1]))
     if not match or not source:
         return None
-    if stored is not None and came_with(source, stored):
+    if stored is not None and is_unsafe(source, stored):
         line = f"{stored} came with a law of delays that could run any code, {source}"
         raise DelayRLError(f"{line}: if you mean it, move its module out of that folder")
     kind = find_object(source)

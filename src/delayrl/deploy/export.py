@@ -13,7 +13,7 @@ from delayrl.envs.task import Task, TaskLike
 from delayrl.play.policy import Policy, restored, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
-from delayrl.run.folder import RunFolder, RunLike
+from delayrl.run.folder import RunFolder, RunLike, path_of
 from delayrl.run.provenance import versions
 from delayrl.run.rows import check_row
 
@@ -39,7 +39,7 @@ def export_run(
         DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
     """
     check_target(Path(out), force=force)
-    source = RunFolder(Path(run))
+    source = RunFolder(path_of(run))
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
     task = task_of(run, env)
     policy = restored(source, config, checkpoint, task, agent)

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 
 from delayrl.errors import DelayRLError
-from delayrl.lookup import attribute, came_with, find_module
+from delayrl.lookup import attribute, find_module, is_unsafe
 
 
 def is_registered(name: str) -> bool:
@@ -61,14 +61,14 @@ def find_stored(name: str, folder: Path) -> Any:
     """Import what a run folder names as `module:object`, if a folder from elsewhere could do no harm by that.
 
     It may name classes of environments and of wrappers, ids that a module registers, and functions of the user's own
-    code. It may not name code that came with it, nor a function of Python or of an installed package: with keyword
-    arguments of its choice that may do anything.
+    code. It may not name code that came with it, nor a function of an installed package: with keyword arguments of its
+    choice that may do anything. The module of such a function is imported before that is known; Python's own never are.
 
     Raises:
         DelayRLError: it may not name this, or `find_object` does not find it.
     """
     refusal = DelayRLError(f"{folder} came with a task that could run any code, {name}: if you mean it, give it as env")
-    if came_with(name, folder):
+    if is_unsafe(name, folder):
         raise refusal
     found = find_object(name)
     if isinstance(found, str) or (isinstance(found, type) and issubclass(found, gym.Env)) or _is_own(found):

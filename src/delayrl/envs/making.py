@@ -10,7 +10,8 @@ from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper
-from delayrl.envs.task import TaskLike, WrapperLike, as_task
+from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task
+from delayrl.errors import DelayRLError, near_names
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.single import check_length
 from delayrl.wrappers.single import check_limit as check_limit
@@ -18,13 +19,16 @@ from delayrl.wrappers.single import name_of as name_of
 from delayrl.wrappers.single import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
 
+OPTIONS = ("env_kwargs", "wrappers", "flatten", "normalise", "rescale", "history", "fill")
+"""Of `make` itself. All others are keyword arguments of what makes the environment."""
+
 
 def make(
     env: TaskLike,
     delay: DelayLike = 0,
     *,
     env_kwargs: Mapping[str, Any] | None = None,
-    wrappers: Sequence[WrapperLike] = (),
+    wrappers: WrapperLike | Sequence[WrapperLike] = (),
     flatten: bool = False,
     normalise: bool = False,
     rescale: bool = False,
@@ -39,7 +43,8 @@ def make(
             that makes an environment.
         delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`; no longer than an episode.
         env_kwargs: keyword arguments for what makes the environment, e.g. {"gain": 2}.
-        wrappers: between the environment and the delay, innermost first: classes, or names such as "filters:LowPass".
+        wrappers: one or several between the environment and the delay, innermost first: classes, or names such as
+            "filters:LowPass".
         flatten: join nested observations (Dict, Tuple, images) to one vector.
         normalise: show deviations from a running mean, in units of the running standard deviation. Both belong to this
             environment; an agent keeps its own (`observation_norm`), and is trained on the task as it is.
@@ -53,7 +58,7 @@ def make(
             is that of its error), unsuitable spaces, a bad delay.
     """
     named = as_task(env, env_kwargs, wrappers, flatten)
-    task: Any = named.make(**options)
+    task: Any = _made(named, options)
     check_spaces(str(named), task.observation_space, task.action_space)
     if normalise:
         task = NormalizeObservation(task)
@@ -63,6 +68,16 @@ def make(
         idle = 2 * (np.clip(0, low, high) - low) / (high - low) - 1
         task = RescaleAction(task, np.float32(-1), np.float32(1))
     return Delayed(task, delay, history, fill, idle)
+
+
+def _made(task: Task, options: dict[str, Any]) -> Any:
+    try:
+        return task.make(**options)
+    except DelayRLError as error:
+        near = [ours for name in options for ours in near_names(name, OPTIONS)]
+        if near and isinstance(error.__cause__, TypeError):
+            raise DelayRLError(f"{error}; did you mean {', '.join(near)}?") from error.__cause__
+        raise
 
 
 def delay_of(env: TaskLike, delay: DelayLike) -> Delay:

@@ -109,14 +109,17 @@ WrapperLike = str | Callable[..., Env]
 
 
 def as_task(
-    env: TaskLike, kwargs: Mapping[str, Any] | None = None, wrappers: Sequence[WrapperLike] = (), flatten: bool = False
+    env: TaskLike,
+    kwargs: Mapping[str, Any] | None = None,
+    wrappers: WrapperLike | Sequence[WrapperLike] = (),
+    flatten: bool = False,
 ) -> Task:
     """Return the task that a user gave.
 
     Args:
         env: as `TaskLike` says.
         kwargs: more keyword arguments for what makes the environment.
-        wrappers: more wrappers, innermost first: classes or functions, or their names `module:object`.
+        wrappers: one more wrapper, or several, innermost first: classes or functions, or their names `module:object`.
         flatten: whether observations are joined to one vector, outside all wrappers.
 
     Raises:
@@ -126,7 +129,7 @@ def as_task(
     task = env if isinstance(env, Task) else _parse(env) if isinstance(env, str) else Task(_named(env))
     first = replace(task.env, kwargs={**task.env.kwargs, **_plain(kwargs or {})})
     around = list(task.wrappers)
-    for wrapper in [wrappers] if isinstance(wrappers, str) else wrappers:
+    for wrapper in [wrappers] if isinstance(wrappers, str) or callable(wrappers) else wrappers:
         more = _parse(wrapper) if isinstance(wrapper, str) else Task(_named(wrapper))
         around += [more.env, *more.wrappers]
     if flatten and around[-1:] != [Part(FLATTEN)]:

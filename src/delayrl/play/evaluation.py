@@ -3,7 +3,6 @@
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -16,12 +15,13 @@ from delayrl.agents.base import Agent, State
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
-from delayrl.envs.making import check_limit, delay_of, make
+from delayrl.envs.making import check_limit, delay_of, make, name_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
-from delayrl.play.policy import Policy, load, task_of, trained_delay
+from delayrl.play import stepping
+from delayrl.play.policy import Policy, load, spec_of, task_of, trained_delay
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import RunFolder, RunLike
+from delayrl.run.folder import RunFolder, RunLike, path_of
 
 
 class Episodes(NamedTuple):
@@ -51,6 +51,7 @@ class Evaluator:
         served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
         self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        check_fits(self._envs[0][0], spec)
         check_limit(self._envs[0][0], str(as_task(env)))
         self._act = _compiled_act(agent)
 
@@ -70,7 +71,7 @@ class Evaluator:
         shape = (len(self._envs), len(self._envs[0]))
         returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
         seen = [
-            [self._see(*env.reset(seed=int(seed))) for env, seed in zip(envs, seeds, strict=True)]
+            [self._see(*stepping.reset(env, int(seed))) for env, seed in zip(envs, seeds, strict=True)]
             for envs, seeds in zip(self._envs, reset_seeds, strict=True)
         ]
         if travel_seeds is not None:
@@ -96,7 +97,7 @@ class Evaluator:
         return Episodes(returns, lengths)
 
     def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
-        return self._envs[at[0]][at[1]].step(action)
+        return stepping.step(self._envs[at[0]][at[1]], action)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
         return seen_now(obs, info, self._delay, privileged=False)
@@ -108,6 +109,14 @@ def servable(env: TaskLike, delay: DelayLike, spec: Spec) -> Delay:
     if served.maximum > spec.delay:
         raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {served.maximum}")
     return served
+
+
+def check_fits(env: Any, spec: Spec) -> None:
+    """Raise DelayRLError if observations or actions of a task have other sizes than those of a policy."""
+    own = spec_of(env)
+    if (own.obs_size, own.action_size) != (spec.obs_size, spec.action_size):
+        line = f"the policy takes observations of size {spec.obs_size} and gives actions of size {spec.action_size}"
+        raise DelayRLError(f"{line}; {name_of(env)} has sizes {own.obs_size} and {own.action_size}")
 
 
 @functools.cache
@@ -128,8 +137,8 @@ def _compiled_act(agent: Agent) -> Any:
 
 def check_seed(seed: int) -> None:
     """Raise DelayRLError unless a seed is a whole number from 0 to 2³¹ - 1."""
-    if not 0 <= seed < 2**31:
-        raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed}")
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**31:
+        raise DelayRLError(f"a seed must be a whole number from 0 to {2**31 - 1}; got {seed!r}")
 
 
 def reset_seed(seed: int, *stream: int) -> int:
@@ -174,7 +183,7 @@ def evaluate(
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
         task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
     else:
-        config, task = RunFolder(Path(run)).config, task_of(run, env, env_kwargs)
+        config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)
         policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
     return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
@@ -189,15 +198,15 @@ def sweep(
     agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
-    name, task = RunFolder(Path(run)).config["agent"], task_of(run, env, env_kwargs)
+    name, task = RunFolder(path_of(run)).config["agent"], task_of(run, env, env_kwargs)
     policy = load(run, task, agent=agent)
     for delay in range(policy.spec.delay + 1):
         yield _play(policy, name, task, delay, episodes, seed)
 
 
 def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:
-    if episodes < 1:
-        raise DelayRLError(f"episodes must be at least 1; got {episodes}")
+    if not isinstance(episodes, int | np.integer) or episodes < 1:
+        raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
     check_seed(seed)
     parsed = delay_of(task, delay)
     evaluator = Evaluator(policy.agent, policy.spec, task, parsed, 1, episodes)
@@ -209,7 +218,7 @@ def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int
         "agent": name,
         "env": str(task),
         "delay": parsed.label(),
-        "episodes": episodes,
+        "episodes": int(episodes),
         "mean_return": float(returns.mean()),
         "std_return": float(returns.std()),
         "returns": returns.tolist(),

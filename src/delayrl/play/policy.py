@@ -1,7 +1,6 @@
 """Trained policies: `load` a run, then `act` on what the wrapper shows."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, agent_of
 from delayrl.run.arrays import restore_tree
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.folder import RunFolder, RunLike
+from delayrl.run.folder import RunFolder, RunLike, path_of
 
 
 class Policy:
@@ -48,8 +47,10 @@ class Policy:
                 `Delayed` puts there.
 
         Raises:
-            DelayRLError: wrong sizes, or an age that the policy was not trained for.
+            DelayRLError: wrong sizes, no age or actions, or an age that the policy was not trained for.
         """
+        if not {"age", "actions"} <= info.keys():
+            raise DelayRLError("the policy needs the info that `Delayed` gives: it has no age and actions here")
         obs, actions, age = np.asarray(obs), np.asarray(info["actions"]), int(info["age"])
         if obs.shape != (self.spec.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.spec.obs_size}; got shape {obs.shape}")
@@ -65,7 +66,7 @@ class Policy:
 
 
 def load(
-    path: RunLike,
+    run: RunLike,
     env: TaskLike | None = None,
     *,
     env_kwargs: Mapping[str, Any] | None = None,
@@ -74,7 +75,7 @@ def load(
     """Load the policy of a run folder from its newest good checkpoint.
 
     Args:
-        path: the run, or its folder.
+        run: the run, or its folder.
         env: what makes its environment, if the run cannot name it (a lambda) or may not (docs/own-task.md). It gets the
             keyword arguments and wrappers of the run.
         env_kwargs: keyword arguments of the environment that replace or complete the run's.
@@ -85,20 +86,20 @@ def load(
         DelayRLError: no run folder, no good checkpoint, one of another agent, a task that cannot be made.
     """
     keep_compiled()
-    run = RunFolder(Path(path))
-    return restored(run, run.config, run.latest(), task_of(path, env, env_kwargs), agent)
+    folder = RunFolder(path_of(run))
+    return restored(folder, folder.config, folder.latest(), task_of(run, env, env_kwargs), agent)
 
 
-def task_of(path: RunLike, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
+def task_of(run: RunLike, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
     """Return the task of a run, or the one given instead, as `load`."""
-    run = RunFolder(Path(path))
-    return stored_task(run.config["env"], run.path, env, env_kwargs)
+    folder = RunFolder(path_of(run))
+    return stored_task(folder.config["env"], folder.path, env, env_kwargs)
 
 
-def trained_delay(path: RunLike) -> Delay:
+def trained_delay(run: RunLike) -> Delay:
     """Return the delay that a run was trained under. A law without a name has its maximum, and cannot be drawn from."""
-    run = RunFolder(Path(path))
-    return stored_delay(run.config["delay"], run.path)
+    folder = RunFolder(path_of(run))
+    return stored_delay(folder.config["delay"], folder.path)
 
 
 def restored(

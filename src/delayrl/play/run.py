@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
-from delayrl.run.folder import RunFolder, RunLike, is_config, seed_folders
+from delayrl.run.folder import RunFolder, RunLike, is_config, path_of, seed_folders
 
 if TYPE_CHECKING:  # they take JAX, and listing runs does not
     from delayrl.envs.task import TaskLike
@@ -33,7 +33,7 @@ class Run:
     """
 
     def __init__(self, path: RunLike) -> None:
-        self.path = Path(path)
+        self.path = path_of(path)
         self._folder = RunFolder(self.path)
 
     def __fspath__(self) -> str:
@@ -54,26 +54,39 @@ class Run:
         return self._folder.config
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one row for each evaluation episode: what was trained, step, start state, return, length."""
-        return self._folder.read("rows")
+        """Return one row for each evaluation episode: what was trained, step, start state, return, length.
+
+        As the functions below, it raises DelayRLError if the folder is no run.
+        """
+        return self._read("rows")
 
     def metrics(self) -> list[dict[str, Any]]:
         """Return losses and speed, a row for every 1,000 steps."""
-        return self._folder.read("metrics")
+        return self._read("metrics")
 
     def episodes(self) -> list[dict[str, Any]]:
         """Return one row for each finished episode of training: step of its end, seed, number, return, length."""
-        return self._folder.read("episodes")
+        return self._read("episodes")
 
     def curve(self, policy: str = "agent") -> Curve:
-        """Return the returns of each evaluation of the agent, or of its delay-free "reference"."""
+        """Return the returns of each evaluation of the agent, or of its delay-free "reference".
+
+        An evaluation that a crash cut off has fewer episodes than the others, and is left out.
+        """
+        if policy not in ("agent", "reference"):
+            raise DelayRLError(f'a curve is that of "agent" or "reference"; got {policy!r}')
         returns: dict[int, list[float]] = {}
         for row in self.rows():
             if row["policy"] == policy:
                 returns.setdefault(row["step"], []).append(row["return"])
-        steps = sorted(returns)
-        table = np.array([returns[step] for step in steps]).reshape(len(steps), -1 if steps else 0)
+        episodes = max(map(len, returns.values()), default=0)
+        steps = sorted(step for step, played in returns.items() if len(played) == episodes)
+        table = np.array([returns[step] for step in steps]).reshape(len(steps), episodes)
         return Curve(np.array(steps, np.int64), table)
+
+    def _read(self, name: str) -> list[dict[str, Any]]:
+        self._folder.check_exists()
+        return self._folder.read(name)
 
     def policy(
         self,
@@ -97,4 +110,4 @@ def runs(folder: str | Path = "runs") -> list[Run]:
 
 def seed_runs(path: RunLike) -> list[Run]:
     """Return the run in a folder, or those of several seeds below it, by their seeds."""
-    return [Run(folder.path) for folder in seed_folders(Path(path))]
+    return [Run(folder.path) for folder in seed_folders(path)]

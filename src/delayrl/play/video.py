@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import chain, count, islice, repeat
+from itertools import chain, count, islice, pairwise, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,17 +15,18 @@ import imageio
 from PIL import Image
 from tqdm import tqdm
 
-from delayrl.delays import DelayLike
+from delayrl.delays import Delay, DelayLike
 from delayrl.envs import make
 from delayrl.envs.making import check_limit, name_of
-from delayrl.envs.task import TaskLike
+from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayRLError, first_line
-from delayrl.play.evaluation import HELD_OUT, check_seed, reset_seed, servable
+from delayrl.play import stepping
+from delayrl.play.evaluation import HELD_OUT, check_fits, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import RunLike
+from delayrl.run.folder import RunLike, path_of
 
 FASTEST = {".mp4": 60, ".gif": 15}
 """Frames per second by kind of file, about. Of tasks with shorter steps not every step is shown."""
@@ -85,12 +86,12 @@ def watch(
     if out.suffix not in FASTEST:
         raise DelayRLError(f"--out must end in .mp4 or .gif; got {out}")
     check_seed(seed)
-    if seconds is not None and not 0 < seconds < math.inf:
-        raise DelayRLError(f"--seconds is a length above 0, such as 8; got {seconds:g}")
+    if seconds is not None and not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
+        raise DelayRLError(f"--seconds is a length above 0, such as 8; got {seconds!r}")
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # what pygame draws with
-    paths = [Path(run)] if compare is None else [Path(run), Path(compare)]
+    paths = [path_of(one) for one in ([run] if compare is None else [run, compare])]
     configs = [Run(path).config for path in paths]
     if configs[0]["env"] != configs[-1]["env"]:
         raise DelayRLError(f"--compare takes a run on {configs[0]['env']}; got one on {configs[-1]['env']}")
@@ -101,13 +102,16 @@ def watch(
             own = agent if config["agent"] == configs[0]["agent"] else None
             policy = load(path, task, agent=own)
             served = servable(task, trained_delay(path) if delay is None else delay, policy.spec)
-            played = make(task, served, render_mode="rgb_array")
+            played = _rendering(task, served)
             stack.callback(close, played)
+            check_fits(played, policy.spec)
             check_limit(played, str(task))
             rate = float(played.metadata.get("render_fps") or 30)
             stride = max(1, round(rate / FASTEST[out.suffix]))
             titles.append(f"{config['agent']}, delay {served.label()}")
             episodes.append(partial(_episode, played, policy, seed, camera, stride))
+        if len(paths) == 2:
+            titles = _apart(titles, paths)
         if seconds is None:
             moments = _together([begin(1) for begin in episodes])
         else:
@@ -124,18 +128,31 @@ def watch(
 def _episode(env: Any, policy: Policy, seed: int, camera: str | None, stride: int, number: int) -> Iterator[Moment]:
     """Play the episode of this number, from 1. Yields every `stride`-th moment of it, and the last."""
     step, total, over = 0, 0.0, False
+    obs, info = stepping.reset(env, reset_seed(seed, HELD_OUT, number - 1))  # as `evaluate` plays them
+    if number == 1:
+        aim(env, camera)
+    yield Moment(_picture(env), number, step, info["age"], total, over)
+    while not over:
+        obs, reward, terminated, truncated, info = stepping.step(env, policy.act(obs, info))
+        step, total, over = step + 1, total + float(reward), terminated or truncated
+        if over or step % stride == 0:
+            yield Moment(_picture(env), number, step, info["age"], total, over)
+
+
+def _rendering(task: Task, delay: Delay) -> Any:
+    """Make an environment that renders. Raises DelayRLError if it does not take `render_mode`, or cannot be made."""
     try:
-        obs, info = env.reset(seed=reset_seed(seed, HELD_OUT, number - 1))  # as `evaluate` plays them
-        if number == 1:
-            aim(env, camera)
-        yield Moment(render(env), number, step, info["age"], total, over)
-        while not over:
-            obs, reward, terminated, truncated, info = env.step(policy.act(obs, info))
-            step, total, over = step + 1, total + float(reward), terminated or truncated
-            if over or step % stride == 0:
-                yield Moment(render(env), number, step, info["age"], total, over)
-    except DelayRLError:
+        return make(task, delay, render_mode="rgb_array")
+    except DelayRLError as error:
+        if isinstance(error.__cause__, TypeError) and "render_mode" in str(error):
+            line = f"a video needs an environment that takes render_mode, and {task} does not"
+            raise DelayRLError(f"{line}: docs/own-task.md shows one") from error
         raise
+
+
+def _picture(env: Any) -> Picture:
+    try:
+        return render(env)
     except Exception as error:  # a renderer may raise anything
         mujoco = hasattr(env.unwrapped, "mujoco_renderer")
         hint = "; Linux without a screen needs EGL (package libegl1)" if mujoco else ""
@@ -163,6 +180,14 @@ def _repeated(episodes: Sequence[Callable[[int], Iterator[Moment]]], pause: int)
     return map(list, zip(*map(side, episodes), strict=True))
 
 
+def _apart(titles: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """Return the titles of two runs, with their folders behind them where they would be the same."""
+    if titles[0] != titles[1] or paths[0] == paths[1]:
+        return list(titles)
+    home = os.path.commonpath([path.absolute() for path in paths])
+    return [f"{title}, {os.path.relpath(path, home)}" for title, path in zip(titles, paths, strict=True)]
+
+
 def _titled(moment: Moment, title: str, several: bool) -> Picture:
     """Write what is played, of `several` episodes which one, and how far it is, into a moment's picture."""
     episode = f", episode {moment.episode}" if several else ""
@@ -178,7 +203,8 @@ def _video(out: Path, rate: float) -> Iterator[Callable[[Any], None]]:
             with out.open("wb") as file:
                 frames: list[Image.Image] = []
                 yield lambda picture: frames.append(_few_colours(picture, frames[:1]))
-                frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=1000 / rate, loop=0)
+                times = _frame_times(len(frames), rate)
+                frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=times, loop=0)
         else:
             with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
                 warnings.simplefilter("ignore", RuntimeWarning)
@@ -186,6 +212,12 @@ def _video(out: Path, rate: float) -> Iterator[Callable[[Any], None]]:
                     yield writer.append_data
     except OSError as error:
         raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def _frame_times(frames: int, rate: float) -> list[int]:
+    """Return how long each frame of a .gif is shown, in ms. A file holds whole hundredths of a second, so they vary."""
+    ends = [10 * round(100 * frame / rate) for frame in range(frames + 1)]
+    return [end - begin for begin, end in pairwise(ends)]
 
 
 def _few_colours(picture: Picture, first: Sequence[Image.Image]) -> Image.Image:

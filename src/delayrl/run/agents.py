@@ -16,7 +16,7 @@ from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import AGENTS, Registration, registered
 from delayrl.errors import DelayRLError
-from delayrl.lookup import came_with, entry_points, find_object, name_of_object, one_line, public_name
+from delayrl.lookup import entry_points, find_object, is_unsafe, name_of_object, one_line, public_name
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 
 GROUP = "delayrl.agents"
@@ -38,6 +38,8 @@ def as_agent(agent: AgentLike) -> Named:
     if isinstance(agent, str):
         name = public_name(agent, GROUP) if ":" in agent else agent
         return Named(name, find_agent(name))
+    if not isinstance(agent, type) and not is_dataclass(agent):
+        raise DelayRLError(f"an agent is a name (`delayrl agents`), MODULE:NAME, a class or an instance; got {agent!r}")
     kind = agent if isinstance(agent, type) else type(agent)
     name, made = name_of_object(kind), _checked(agent, kind.__name__)
     if not name.startswith("<") and not _is_made_of(name, made):
@@ -63,10 +65,12 @@ def find_agent(name: str, stored: Path | None = None) -> Registration:
     if ":" not in name:
         declared = entry_points(GROUP)
         if name not in declared:
-            near = difflib.get_close_matches(name, [*AGENTS, *declared], n=2, cutoff=0.4) or [*AGENTS, *declared]
-            raise DelayRLError(f"unknown agent {name!r}; did you mean {', '.join(near)}?")
+            near = difflib.get_close_matches(name, agent_names(), n=2, cutoff=0.5)
+            usual = "`delayrl agents` lists them; one of your own is MODULE:NAME, and a run is named by its folder"
+            hint = f"did you mean {', '.join(near)}?" if near else usual
+            raise DelayRLError(f"unknown agent {name!r}; {hint}")
         source = declared[name]
-    if stored is not None and came_with(source, stored):
+    if stored is not None and is_unsafe(source, stored):
         what = f"an agent that could run any code, {source}"
         raise DelayRLError(f"{stored} came with {what}: if you mean it, give it as agent")
     found = find_object(source)
@@ -97,6 +101,11 @@ def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = 
     check_names(config["hyperparameters"], agent)
     agent = override(agent, {**(OLDER if config["agent"] in AGENTS else {}), **config["hyperparameters"]})
     return NormalisedObservations(agent) if config["schedule"].get("observation_norm") == "running" else agent
+
+
+def agent_names() -> list[str]:
+    """Return the names of the agents of the registry and of installed packages. Imports none of the latter."""
+    return [*AGENTS, *entry_points(GROUP)]
 
 
 def known_agents() -> dict[str, Registration]:

@@ -53,7 +53,7 @@ class Option:
             raise DelayRLError(f"{self.name} must lie in {self.bounds[0]:g} .. {self.bounds[1]:g}; got {value!r}")
         if self.kind is float:
             return float(value)
-        least = 0 if self.default == 0 else 1
+        least = 0 if 0 in (self.default, self.bounds[0]) else 1  # a preset may have another default
         if value != int(value) or value < least:
             raise DelayRLError(f"{self.name} must be a whole number, at least {least}; got {value!r}")
         return int(value)
@@ -89,7 +89,7 @@ def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) 
     known = [option.name for config in configs for option in options(config)] + list(also)
     for name in values:
         if name not in known:
-            near = near_names(name, known)
+            near = near_names(name, [*known, "start_from"])  # an option of `train` alone
             hint = f"did you mean {', '.join(near)}?" if near else "`delayrl train AGENT --help` lists them"
             raise DelayRLError(f"unknown hyperparameter {name!r}; {hint}")
 

@@ -59,8 +59,7 @@ class RunFolder:
     def config(self) -> dict[str, Any]:
         """What was trained. Raises DelayRLError if the folder is no run."""
         file = self.path / "config.json"
-        if not file.is_file():
-            raise DelayRLError(f"{self.path} is not a run folder: it has no config.json")
+        self.check_exists()
         try:
             config = json.loads(file.read_text())
         except (ValueError, OSError) as error:
@@ -71,6 +70,13 @@ class RunFolder:
         if config["format"] != FORMAT:
             raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
         return config  # type: ignore[no-any-return]
+
+    def check_exists(self) -> None:
+        """Raise DelayRLError if no run has begun here. The message names the runs of several seeds."""
+        if not self.exists:
+            below = ", ".join(map(str, _below(self.path)))
+            hint = f"; its runs are {below}" if below else ""
+            raise DelayRLError(f"{self.path} is not a run folder: it has no config.json{hint}")
 
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""
@@ -186,12 +192,24 @@ class RunFolder:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def seed_folders(path: Path) -> list[RunFolder]:
+def path_of(run: RunLike) -> Path:
+    """Return the path of a run's folder. Raises DelayRLError for what is none, such as the list of several runs."""
+    if isinstance(run, str | PathLike):
+        return Path(run)
+    what = "this is a list of runs" if isinstance(run, list | tuple) else f"got {run!r}"
+    raise DelayRLError(f"give one run, or the path of its folder; {what}")
+
+
+def seed_folders(run: RunLike) -> list[RunFolder]:
     """Return the run in a folder, or those of several seeds below it, as `train(seeds=…)` makes them."""
-    below = sorted(path.glob("seed*/config.json"), key=lambda file: (len(file.parent.name), file.parent.name))
-    if RunFolder(path).exists or not below:
-        return [RunFolder(path)]
-    return [RunFolder(file.parent) for file in below]
+    one = RunFolder(path_of(run))
+    return [one] if one.exists else [RunFolder(path) for path in _below(one.path)] or [one]
+
+
+def _below(path: Path) -> list[Path]:
+    """Return the run folders of several seeds, by their seeds."""
+    folders = [file.parent for file in path.glob("seed*/config.json")]
+    return sorted(folders, key=lambda folder: (len(folder.name), folder.name))
 
 
 def is_config(file: Path) -> bool:

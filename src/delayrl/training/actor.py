@@ -9,6 +9,7 @@ from delayrl.core.protocol import CORRECTED, Protocol
 from delayrl.core.types import Seen, Transition
 from delayrl.core.views import seen_now
 from delayrl.errors import DelayRLError
+from delayrl.play import stepping
 from delayrl.play.evaluation import TRAINING, reset_seed
 from delayrl.wrappers import Delayed
 
@@ -31,10 +32,10 @@ class Actor:
         self.episode, self.actions, self.total = episode, list[NDArray[np.float32]](), 0.0
         own_seed = reset_seed(self.seed, TRAINING, episode)
         if self.protocol.start_states == "same":
-            self.env.reset(seed=self.seed)
+            stepping.reset(self.env, self.seed)
             shown = self.env.draw_from(own_seed)  # one start state, but not one sequence of travel times
         else:
-            shown = self.env.reset(seed=own_seed)
+            shown = stepping.reset(self.env, own_seed)
         self._see(*shown)
 
     def step(self, action: NDArray[np.float32]) -> Transition:
@@ -42,7 +43,7 @@ class Actor:
         if not np.isfinite(action).all():
             raise DelayRLError(f"the policy of seed {self.seed} gives actions that are not finite: training diverged")
         truth, age = self.truth, self.seen.age
-        obs, reward, terminated, truncated, info = self.env.step(action)
+        obs, reward, terminated, truncated, info = stepping.step(self.env, action)
         self.actions.append(action)
         self._see(obs, info)
         reward, done = float(reward), terminated or truncated
@@ -68,7 +69,7 @@ class Actor:
         """Come back to the middle of an episode: the same seed and actions lead to the same state."""
         self.start_episode(episode)
         for action in actions:
-            obs, reward, _, _, info = self.env.step(action)
+            obs, reward, _, _, info = stepping.step(self.env, action)
             self.actions.append(action)
             self.total += float(reward)
             self._see(obs, info)
@@ -80,6 +81,5 @@ class Actor:
             self._refuse("an observation")
 
     def _refuse(self, what: str) -> None:
-        raise DelayRLError(
-            f"the environment gave {what} that is not finite: step {len(self.actions)}, episode {self.episode}"
-        )
+        at = f"step {len(self.actions)}, episode {self.episode}"
+        raise DelayRLError(f"the environment gave {what} that is not finite: {at}")

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from delayrl.agents.registry import AGENTS
@@ -14,7 +13,7 @@ from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
-from delayrl.run.folder import RunFolder, RunLike, seed_folders
+from delayrl.run.folder import RunFolder, RunLike, path_of, seed_folders
 from delayrl.training.loop import Callback
 from delayrl.training.train import train_group
 
@@ -57,7 +56,7 @@ def go_on(
     Raises:
         DelayRLError: no run, fewer steps than it has, a run whose replay is gone, and what `train` raises.
     """
-    runs = seed_folders(Path(run))
+    runs = seed_folders(run)
     configs = [one.config for one in runs]
     task = stored_task(configs[0]["env"], runs[0].path, env, env_kwargs)
     if agent is None:
@@ -80,7 +79,7 @@ def go_on(
         further=True,
     )
     ended = [Run(one.path) for one in runs]
-    return ended[0] if runs[0].path == Path(run) else ended
+    return ended[0] if runs[0].path == path_of(run) else ended
 
 
 def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Delay, steps: int) -> Setup:

@@ -3,6 +3,9 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
@@ -12,18 +15,18 @@ from delayrl.run.folder import RunFolder
 
 def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
     """Return the seeds to train: `seeds` many from `seed` on, or those listed. Raises DelayRLError for bad ones."""
-    if isinstance(seeds, int):
+    check_seed(seed)
+    if isinstance(seeds, int | np.integer):
         if seeds < 1:
             raise DelayRLError(f"seeds must be at least 1; got {seeds}")
-        numbers = list(range(seed, seed + seeds))
+        numbers: list[Any] = list(range(seed, seed + seeds))
     else:
-        numbers = list(seeds)
-        different = len(set(numbers)) == len(numbers) and all(isinstance(number, int) for number in numbers)
-        if seed or not numbers or not different:
+        numbers = list(seeds) if isinstance(seeds, Sequence) else []
+        if seed or not numbers or len(set(numbers)) < len(numbers):
             raise DelayRLError(f"seeds is a number, or a list of different seeds without seed=; got {seeds!r}")
-    check_seed(min(numbers))
-    check_seed(max(numbers))
-    return numbers
+    for number in numbers:
+        check_seed(number)
+    return [int(number) for number in numbers]
 
 
 def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[RunFolder]:

@@ -21,7 +21,7 @@ from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup, resolve
-from delayrl.run.folder import RunFolder, RunLike
+from delayrl.run.folder import RunFolder, RunLike, path_of
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.checks import check_fit, check_ways
@@ -74,7 +74,7 @@ def train(
         preset: "paper", "matched" or "small": which hyperparameters to start from (docs/cli.md).
         seed: fixes everything: environments, networks, sampling.
         seeds: trains the seeds seed .. seed + seeds - 1 in lockstep, or those of a list.
-        out: the run folder; with several seeds the folder of their run folders.
+        out: the run folder of one seed, of a list of one too; of several seeds the folder of their run folders.
         device: "cpu" or "gpu"; None leaves the choice to JAX.
         overwrite: start afresh where a run exists.
         protocol: "corrected", or "official": the released code's habits (docs/concepts.md).
@@ -99,7 +99,7 @@ def train(
     folders = run_folders(setup.condition, numbers, out)
     source = None
     if start_from is not None:
-        origin, source = source_of(RunFolder(Path(start_from)), [] if overwrite else folders)
+        origin, source = source_of(RunFolder(path_of(start_from)), [] if overwrite else folders)
         setup = replace(setup, origin={"from": origin})
     train_group(
         setup,
