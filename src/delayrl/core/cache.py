@@ -7,6 +7,7 @@ import platform
 import stat
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -24,7 +25,8 @@ def keep_compiled() -> Path | None:
     Returns:
         The folder; None where JAX is set up already, or where no such folder can be made.
     """
-    if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
+    config: Any = jax.config  # JAX 0.10 declares no types
+    if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
         return None
     try:
         given = Path(os.environ.get("XDG_CACHE_HOME", ""))  # a relative one is to be ignored
@@ -37,9 +39,9 @@ def keep_compiled() -> Path | None:
         _prune(folder)
     except (OSError, RuntimeError):  # no home, or one that cannot be written to
         return None
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+    config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     return folder
 
 
