@@ -3,7 +3,7 @@
 set -euo pipefail
 
 wheel=$(realpath "$1") place=$(realpath "$2") home=$(dirname "$(realpath "$0")")
-export JAX_COMPILATION_CACHE_DIR="$place/jax" JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
+export JAX_COMPILATION_CACHE_DIR="$place/compiled" JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 mkdir "$place/users"
 cp "$home"/*.py "$home/../../examples/ros2_node.py" "$place/users"
 cp -r "$home/package" "$place/package"
