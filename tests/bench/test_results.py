@@ -254,7 +254,7 @@ def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkey
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("plan nosuch", "unknown grid 'nosuch'; give a .toml file, or one of any-age-ladder, first"),
+        ("plan nosuch", "unknown grid 'nosuch'; give a .toml file, or one of any-age-ladder, evidence-1"),
         ("plan ./nosuch.toml", "there is no grid file nosuch.toml"),
         ("run smoke --cells 123", "has no cell 123"),
         ("run smoke --workers 0", "--workers must be at least 1"),

@@ -199,7 +199,9 @@ class VDPO:
 
     def _some(self, windows: Window) -> Window:
         """Return the windows that belief and cloning learn from: each brings Δ tokens, which is what they cost."""
-        number = -(-self.tokens // windows.delay) if self.tokens else self.reference.batch_size
+        if not self.tokens:
+            return windows
+        number = -(-self.tokens // windows.delay)
         return jax.tree.map(lambda x: x[:number], windows)
 
     def _cloned(self, encoder: Params, head: Params) -> Params:
