@@ -1,5 +1,6 @@
 """Point 5: an agent and a law of one's own, of the package in `package/`; see `.ci/run`."""
 
+import json
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -99,7 +100,8 @@ point(5, "a run folder that came with code of its own")
 trap = delayrl.Run(shutil.copytree("package", "downloaded"))
 Path("downloaded/trap.py").write_text("open('caught', 'w')")
 for name, value in {"agent": "Agent", "env": "make", "delay": "Law(steps=3)"}.items():
-    trap.create(whole.config | {name: f"downloaded.trap:{value}"})
+    trap.path.mkdir(exist_ok=True)
+    (trap.path / "config.json").write_text(json.dumps(whole.config | {name: f"downloaded.trap:{value}"}))
     for command in ("evaluate downloaded", "export downloaded --out b", "train downloaded --steps 400"):
         refused(f"delayrl {command}", "downloaded came with", "could run any code, downloaded.trap:")
 holds("its module was not imported", not Path("caught").exists())
