@@ -7,7 +7,7 @@ from typing import Any
 
 from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
-from delayrl.play.run import Run
+from delayrl.play.run import Run, runs
 
 NAMES = ("agent", "preset", "env", "delay", "seed")
 
@@ -20,8 +20,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> None:
     """Print what each run trains, how far it is, and its last return; of one that cannot be read why."""
-    from delayrl.play.run import runs
-
     rows = [_row(one) for one in runs(given.folder)]
     if given.json:
         print(json.dumps(rows))
