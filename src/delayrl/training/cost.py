@@ -54,11 +54,13 @@ def cost_of(agent: Agent, spec: Spec, schedule: Schedule) -> Cost:
 def update_counts(phase: Phase, first: int, last: int) -> NDArray[np.int32]:
     """Return the numbers of a phase's updates from step `first` to step `last`, as the learner counts them.
 
-    Of many only every STRIDE-th, [C].
+    Of many only every STRIDE-th, or every STRIDE²-th and so on, [C].
     """
-    rounds = np.arange(-(-first // phase.every), last // phase.every + 1)
-    counts = (rounds[:, None] * phase.updates + np.arange(phase.updates)).ravel().astype(np.int32)
-    return counts[::STRIDE] if counts.size > 1000 * STRIDE else counts
+    begin, end = -(-first // phase.every) * phase.updates, (last // phase.every + 1) * phase.updates
+    stride = 1
+    while end - begin > 1000 * STRIDE * stride:
+        stride *= STRIDE
+    return np.arange(begin, end, stride).astype(np.int32)
 
 
 def _named_leaves(state: Any) -> list[tuple[str, Any]]:
