@@ -10,39 +10,19 @@ import pytest
 
 from delayrl.bench.backends import local
 from delayrl.bench.grid import load_grid
+from delayrl.training import machine
 
 
 def test_as_many_workers_as_cores_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local, "cores", lambda: 8)
-    monkeypatch.setattr(local, "entry_points", lambda group: [])
+    monkeypatch.setattr(machine, "entry_points", lambda group: [])
     for gigabytes, replay, expected in ((64, 0, 8), (64, 10, 5), (8, 0, 5), (1, 10, 1)):
         monkeypatch.setattr(local, "free_memory", lambda gigabytes=gigabytes: gigabytes * 2**30)
         assert local.default_workers(None, replay * 2**30) == expected
-    monkeypatch.setattr(local, "entry_points", lambda group: ["cuda"])
+    monkeypatch.setattr(machine, "entry_points", lambda group: ["cuda"])
     assert [local.default_workers(device, 0) for device in (None, "gpu", "cpu")] == [1, 1, 1]
     monkeypatch.setattr(local, "free_memory", lambda: 2**62)
     assert local.default_workers("cpu", 0) == 8
-
-
-def test_free_memory() -> None:
-    """Some of this machine's, or unlimited where nobody says."""
-    assert local.free_memory() > 2**20
-    if hasattr(os, "sysconf") and Path("/proc/meminfo").exists():
-        assert local.free_memory() < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def test_containers_have_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limits of a control group count, where there are any."""
-    whole, free = local.cores(), local.free_memory()
-    says = {"cpu.max": "250000 100000", "memory.max": str(2**30), "memory.current": str(2**29)}
-    monkeypatch.setattr(local, "limit", says.get)
-    assert local.cores() == min(whole, 2)
-    assert local.free_memory() == 2**29
-    says["cpu.max"] = "50000 100000"
-    assert local.cores() == 1
-    says |= {"cpu.max": "max 100000", "memory.max": "max"}
-    assert local.cores() == whole
-    assert local.free_memory() > free / 2
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not pin processes")

@@ -27,6 +27,7 @@ from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.checks import check_fit, check_ways
 from delayrl.training.learner import compiled
 from delayrl.training.loop import Callback, run
+from delayrl.training.machine import shared
 from delayrl.training.resume import source_of, start
 from delayrl.training.seeds import run_folders, seed_numbers
 from delayrl.training.state import Group
@@ -158,4 +159,7 @@ def train_group(
 
         if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
-        run(group, start(group, actors, overwrite, note), note, progress=progress, track=track, callback=callback)
+        state = start(group, actors, overwrite, note)
+        if state.step < setup.schedule.steps and (lines := shared(numbers, device)):
+            note(lines)
+        run(group, state, note, progress=progress, track=track, callback=callback)

@@ -3,19 +3,18 @@
 import contextlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from delayrl.bench.worker import Outcome
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell
+from delayrl.training.machine import cores, free_memory, uses_accelerator
 
 WORKER_BYTES = 3 * 2**29
 """Memory of a worker beside its replays: programs, libraries, a task (1 to 1.5 GB measured)."""
@@ -101,11 +100,6 @@ def default_workers(device: str | None, replay_bytes: int) -> int:
     return max(1, min(cores(), free_memory() // (WORKER_BYTES + replay_bytes)))
 
 
-def uses_accelerator(device: str | None) -> bool:
-    """Whether workers on this device compute elsewhere than on the processor."""
-    return device != "cpu" and bool(entry_points(group="jax_plugins"))
-
-
 def free_core(own: Mapping[int, int | None]) -> int | None:
     """Return the core with the fewest workers; None if processes cannot be kept on one.
 
@@ -121,27 +115,3 @@ def free_core(own: Mapping[int, int | None]) -> int | None:
             if b"delayrl.bench.worker" in words and b"--core" in words and int(process.name) not in own:
                 taken[int(words[words.index(b"--core") + 1])] += 1
     return min(sorted(os.sched_getaffinity(0)), key=lambda core: taken[core])
-
-
-def cores() -> int:
-    """Return how many cores this process may keep busy: those that it may run on, or a container's share of them."""
-    number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota, _, period = limit("cpu.max").partition(" ")
-    return max(1, min(number, int(quota) // int(period))) if quota.isdigit() and period.isdigit() else number
-
-
-def free_memory() -> int:
-    """Return the bytes that new processes can take, in a container too; where nobody says, as if there was enough."""
-    about = Path("/proc/meminfo")
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", about.read_text(), re.MULTILINE) if about.exists() else None
-    free = int(found[1]) * 1024 if found else 2**62
-    most, used = limit("memory.max"), limit("memory.current")
-    return min(free, int(most) - int(used)) if most.isdigit() and used.isdigit() else free
-
-
-def limit(name: str) -> str:
-    """Return what a file of the control group of a container says; nothing where there is none."""
-    try:
-        return Path("/sys/fs/cgroup", name).read_text().strip()
-    except OSError:
-        return ""

@@ -1,0 +1,55 @@
+"""What this machine has for training: cores, memory, an accelerator; and how seeds are shared between the cores."""
+
+import os
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+
+
+def cores() -> int:
+    """Return how many cores this process may keep busy: those that it may run on, or a container's share of them."""
+    number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota, _, period = limit("cpu.max").partition(" ")
+    return max(1, min(number, int(quota) // int(period))) if quota.isdigit() and period.isdigit() else number
+
+
+def free_memory() -> int:
+    """Return the bytes that new processes can take, in a container too; where nobody says, as if there was enough."""
+    about = Path("/proc/meminfo")
+    found = re.search(r"^MemAvailable:\s+(\d+) kB", about.read_text(), re.MULTILINE) if about.exists() else None
+    free = int(found[1]) * 1024 if found else 2**62
+    most, used = limit("memory.max"), limit("memory.current")
+    return min(free, int(most) - int(used)) if most.isdigit() and used.isdigit() else free
+
+
+def limit(name: str) -> str:
+    """Return what a file of the control group of a container says; nothing where there is none."""
+    try:
+        return Path("/sys/fs/cgroup", name).read_text().strip()
+    except OSError:
+        return ""
+
+
+def uses_accelerator(device: str | None) -> bool:
+    """Whether workers on this device compute elsewhere than on the processor."""
+    return device != "cpu" and bool(entry_points(group="jax_plugins"))
+
+
+def shared(seeds: list[int], device: str | None) -> str:
+    """Return in words how seeds would learn faster than in one process, or "" if that is best.
+
+    Processes of one core each learn more in an hour than one that has all cores (docs/performance.md).
+    """
+    number = min(cores(), len(seeds))
+    one_is_best = number == 1 or uses_accelerator(device) or not hasattr(os, "sched_getaffinity")
+    if one_is_best or seeds != list(range(seeds[0], seeds[0] + len(seeds))):
+        return ""
+    commands, rest = [], seeds
+    for i, core in enumerate(sorted(os.sched_getaffinity(0))[:number]):
+        share = len(seeds) // number + (i < len(seeds) % number)
+        commands.append(f"  taskset -c {core} delayrl train … --seed {rest[0]} --seeds {share} &")
+        rest = rest[share:]
+    if number > 3:
+        commands[1:-1] = ["  …"]
+    first = f"seeds: {len(seeds)} share one process; {number} processes of one core each learn more in an hour:"
+    return "\n".join([first, *commands, "  or `delayrl bench run`, which does so by itself"])

@@ -1,0 +1,52 @@
+"""What this machine has, and how seeds are shared between its cores."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from delayrl.training import machine
+from delayrl.training.machine import shared
+
+
+def test_free_memory() -> None:
+    """Some of this machine's, or unlimited where nobody says."""
+    assert machine.free_memory() > 2**20
+    if hasattr(os, "sysconf") and Path("/proc/meminfo").exists():
+        assert machine.free_memory() < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def test_containers_have_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits of a control group count, where there are any."""
+    whole, free = machine.cores(), machine.free_memory()
+    says = {"cpu.max": "250000 100000", "memory.max": str(2**30), "memory.current": str(2**29)}
+    monkeypatch.setattr(machine, "limit", says.get)
+    assert machine.cores() == min(whole, 2)
+    assert machine.free_memory() == 2**29
+    says["cpu.max"] = "50000 100000"
+    assert machine.cores() == 1
+    says |= {"cpu.max": "max 100000", "memory.max": "max"}
+    assert machine.cores() == whole
+    assert machine.free_memory() > free / 2
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not pin processes")
+def test_several_seeds_are_told_how_they_would_be_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each seed is in one command, each command on a core that this process may use."""
+    monkeypatch.setattr(machine, "entry_points", lambda group: [])
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4, 6, 7, 9, 11})
+    monkeypatch.setattr(machine, "limit", lambda name: "")
+    assert [line for line in shared([3, 4, 5, 6, 7], None).splitlines() if "taskset" in line] == [
+        "  taskset -c 4 delayrl train … --seed 3 --seeds 1 &",
+        "  taskset -c 11 delayrl train … --seed 7 --seeds 1 &",
+    ]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4, 6})
+    assert shared([3, 4, 5, 6, 7], "cpu").splitlines()[1:3] == [
+        "  taskset -c 4 delayrl train … --seed 3 --seeds 3 &",
+        "  taskset -c 6 delayrl train … --seed 6 --seeds 2 &",
+    ]
+    assert shared([3], None) == shared([3, 5], None) == ""
+    monkeypatch.setattr(machine, "entry_points", lambda group: ["cuda"])
+    assert shared([3, 4], None) == shared([3, 4], "gpu") == ""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4})
+    assert shared([3, 4], "cpu") == ""
