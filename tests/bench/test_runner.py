@@ -19,7 +19,7 @@ from delayrl.bench.grid import load_grid
 from delayrl.bench.runner import run_cells
 from delayrl.bench.status import line, seconds_left, standing
 from delayrl.bench.worker import Outcome
-from delayrl.cli.bench import seconds
+from delayrl.cli.bench import idle, seconds
 from delayrl.cli.main import main
 from delayrl.run.cell import Cell, Progress
 from delayrl.run.condition import Condition
@@ -339,6 +339,15 @@ def test_time_left(tmp_path: Path) -> None:
     assert seconds_left(now, 2) == pytest.approx(100 / 7.5)  # the longest cell alone
     assert seconds_left([(some[0], Progress("todo", 0))], 1) is None
     assert seconds_left(now[:1], 1) == 0
+
+
+def test_a_small_grid_is_told_how_to_use_all_workers() -> None:
+    condition = Condition("sac", "Pendulum-v1", 0, "small", "corrected", 100)
+    many, two, one = (Cell(condition, seeds, "id") for seeds in [(0, 1, 2, 3, 4), (0, 1), (5,)])
+    assert idle([many], 2).startswith("1 of 2 workers have no cell; with `lockstep = 2`")
+    assert "2 of 4 workers" in idle([many, one], 4) and "`lockstep = 1`" in idle([many, one], 4)
+    for enough in ([many, one], [two, two, two], [one], []):
+        assert idle(enough, 2) == ""
 
 
 @pytest.mark.parametrize(("text", "value"), [("90s", 90), ("9m", 540), ("1h30m", 5400), ("2d", 172800)])

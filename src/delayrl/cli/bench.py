@@ -122,6 +122,8 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
         _write_slurm(grid, cells, given)
         return
     backend, workers = _backend(given, grid)
+    if given.backend == "local" and (words := idle([c for c in cells if status(c, given.runs) != "done"], workers)):
+        print(words, file=sys.stderr)
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
     with stop_signal() as stop:
         tries, limit, say, tick = given.tries, given.time_limit, status_line.say, status_line.update
@@ -135,6 +137,16 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     if completion.unfinished:
         print("stopped at a checkpoint; the same command resumes it")
         sys.exit(STOPPED)
+
+
+def idle(cells: Sequence[Cell], workers: int) -> str:
+    """Return how a grid with fewer cells than workers would keep all of them busy, or ""."""
+    runs = sum(len(cell.seeds) for cell in cells)
+    if not len(cells) < min(workers, runs):
+        return ""
+    most = max(1, runs // workers)
+    left = f"{workers - len(cells)} of {workers} workers have no cell"
+    return f"{left}; with `lockstep = {most}` in the grid there are more cells, of at most {most} seeds each"
 
 
 def _backend(given: argparse.Namespace, grid: Grid) -> tuple[Any, int]:
