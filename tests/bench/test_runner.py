@@ -345,7 +345,8 @@ def test_a_small_grid_is_told_how_to_use_all_workers() -> None:
     condition = Condition("sac", "Pendulum-v1", 0, "small", "corrected", 100)
     many, two, one = (Cell(condition, seeds, "id") for seeds in [(0, 1, 2, 3, 4), (0, 1), (5,)])
     assert idle([many], 2).startswith("1 of 2 workers have no cell; with `lockstep = 2`")
-    assert "2 of 4 workers" in idle([many, one], 4) and "`lockstep = 1`" in idle([many, one], 4)
+    assert "2 of 4 workers" in idle([many, one], 4)
+    assert "`lockstep = 1`" in idle([many, one], 4)
     for enough in ([many, one], [two, two, two], [one], []):
         assert idle(enough, 2) == ""
 
