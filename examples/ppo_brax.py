@@ -11,6 +11,7 @@ import argparse
 import json
 import time
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from brax import envs
 from brax.training.agents.ppo import networks, train
 
 from delayrl.batched.brax import wrap
+from delayrl.run.provenance import versions
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -31,30 +33,32 @@ VIEWS = {
     "augmented": {"augment": True, "value": "state"},
     "privileged": {"augment": True, "value": "privileged_state"},
 }
-PPO = {"num_minibatches": 32, "unroll_length": 5, "batch_size": 256, "normalize_observations": True, "seed": 0}
-TASKS: dict[str, dict[str, Any]] = {  # of brax's notebook, with fewer robots and smaller batches
-    "inverted_pendulum": {
+PPO = {"num_timesteps": 1_000_000, "discounting": 0.97, "learning_rate": 3e-4, "normalize_observations": True}
+TASKS: dict[str, dict[str, Any]] = {
+    "inverted_pendulum": {  # of brax's notebook, with fewer robots and smaller batches
         **PPO,
         "backend": "positional",  # "spring" is faster, but PPO does not learn this task there, delayed or not
-        "num_timesteps": 1_000_000,
-        "discounting": 0.97,
-        "entropy_cost": 1e-2,
-        "learning_rate": 3e-4,
+        "num_envs": 512,
+        "unroll_length": 5,
+        "batch_size": 256,
+        "num_minibatches": 32,
         "num_updates_per_batch": 4,
+        "entropy_cost": 1e-2,
         "reward_scaling": 10,
     },
-    "halfcheetah": {
+    "halfcheetah": {  # few robots and many updates: a million steps are enough
         **PPO,
         "backend": "spring",
-        "num_timesteps": 5_000_000,
-        "discounting": 0.95,
-        "entropy_cost": 1e-3,
-        "learning_rate": 3e-4,
+        "num_envs": 64,
+        "unroll_length": 16,
+        "batch_size": 8,
+        "num_minibatches": 16,
         "num_updates_per_batch": 8,
-        "unroll_length": 20,
+        "entropy_cost": 1e-3,
         "reward_scaling": 1,
     },
 }
+HIDDEN = {"policy_hidden_layer_sizes": (128, 128), "value_hidden_layer_sizes": (128, 128)}
 
 if not hasattr(jax, "device_put_replicated"):  # brax 0.14 calls what JAX 0.10 has removed
 
@@ -68,27 +72,24 @@ def learn(given: argparse.Namespace, view: str, seed: int) -> list[dict[str, Any
     """Train one policy. Returns a row for each evaluation, the mean of 128 episodes."""
     rows: list[dict[str, Any]] = []
     began = time.perf_counter()
+    options = TASKS[given.task] | {"seed": seed, "episode_length": given.episode_length}
+    options |= {"num_timesteps": given.steps} if given.steps else {}
     what = {"task": given.task, "delay": given.delay, "view": view, "seed": seed}
+    what |= {"options": options, "versions": versions() | {"brax": version("brax")}}
 
     def evaluated(step: int, metrics: dict[str, Any]) -> None:
         row = {**what, "step": int(step), "return": float(metrics["eval/episode_reward"])}
         rows.append({**row, "seconds": round(time.perf_counter() - began, 1)})
-        print(json.dumps(rows[-1]), flush=True)
+        print(f"{given.task} {view}, seed {seed}: {step:,} steps, return {row['return']:.0f}", flush=True)
 
-    options = TASKS[given.task] | {"seed": seed}
-    backend = options.pop("backend")
-    if given.steps:
-        options["num_timesteps"] = given.steps
     train.train(
-        envs.get_environment(given.task, backend=backend),
-        episode_length=given.episode_length,
-        num_envs=given.envs,
+        envs.get_environment(given.task, backend=options["backend"]),
         num_evals=given.evaluations,
-        network_factory=partial(networks.make_ppo_networks, value_obs_key=VIEWS[view]["value"]),
+        network_factory=partial(networks.make_ppo_networks, value_obs_key=VIEWS[view]["value"], **HIDDEN),
         wrap_env_fn=partial(wrap, delay=given.delay, augment=VIEWS[view]["augment"]),
         deterministic_eval=True,
         progress_fn=evaluated,
-        **options,
+        **{name: value for name, value in options.items() if name != "backend"},
     )
     return rows
 
@@ -122,7 +123,6 @@ def main() -> None:
     parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--steps", type=int, help="environment steps of a run (default: the task's)")
-    parser.add_argument("--envs", type=int, default=512, help="simulated robots (default: %(default)s)")
     parser.add_argument("--episode-length", type=int, default=1000)
     parser.add_argument("--evaluations", type=int, default=11)
     parser.add_argument("--out", type=Path, default=Path("ppo"))
