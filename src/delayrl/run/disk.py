@@ -50,6 +50,28 @@ def remove(path: Path) -> None:
 
 
 @contextlib.contextmanager
+def lock(folder: Path) -> Iterator[bool]:
+    """Lock a folder until the block or the process ends; yield whether it was free (always where nothing can lock)."""
+    try:
+        import fcntl  # POSIX only
+    except ImportError:
+        yield True
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        free = True
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            free = False
+        except OSError:  # a file system without locks
+            pass
+        yield free
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
     """Turn what the disk refuses into one line."""
     try:

@@ -15,7 +15,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, save_arrays
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
-from delayrl.run.disk import disk_errors, draft, remove, write_file, write_flushed
+from delayrl.run.disk import disk_errors, draft, lock, remove, write_file, write_flushed
 
 FORMAT = 1
 NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
@@ -77,6 +77,22 @@ class RunFolder:
             below = ", ".join(map(str, _below(self.path)))
             hint = f"; its runs are {below}" if below else ""
             raise DelayRLError(f"{self.path} is not a run folder: it has no config.json{hint}")
+
+    @contextlib.contextmanager
+    def hold(self) -> Iterator[None]:
+        """Keep the run for this process until the block ends. Raises DelayRLError if another process trains it."""
+        made = [path for path in (self.path, *self.path.parents) if not path.exists()]
+        with disk_errors(self.path), contextlib.suppress(FileExistsError):  # a file: it is refused later
+            self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            with lock(self.path) as free:
+                if not free:
+                    raise DelayRLError(f"{self.path} is being trained by another process")
+                yield
+        finally:
+            for path in made:  # what was refused leaves nothing
+                with contextlib.suppress(OSError):
+                    path.rmdir()
 
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""

@@ -5,6 +5,8 @@ import re
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from delayrl.run.folder import RunFolder
+
 
 def cores() -> int:
     """Return how many cores this process may keep busy: those that it may run on, or a container's share of them."""
@@ -35,7 +37,7 @@ def uses_accelerator(device: str | None) -> bool:
     return device != "cpu" and bool(entry_points(group="jax_plugins"))
 
 
-def shared(seeds: list[int], device: str | None) -> str:
+def shared(seeds: list[int], folders: list[RunFolder], device: str | None) -> str:
     """Return in words how seeds would learn faster than in one process, or "" if that is best.
 
     Processes of one core each learn more in an hour than one that has all cores (docs/performance.md).
@@ -44,12 +46,13 @@ def shared(seeds: list[int], device: str | None) -> str:
     one_is_best = number == 1 or uses_accelerator(device) or not hasattr(os, "sched_getaffinity")
     if one_is_best or seeds != list(range(seeds[0], seeds[0] + len(seeds))):
         return ""
-    commands, rest = [], seeds
+    commands, first = [], 0
     for i, core in enumerate(sorted(os.sched_getaffinity(0))[:number]):
         share = len(seeds) // number + (i < len(seeds) % number)
-        commands.append(f"  taskset -c {core} delayrl train … --seed {rest[0]} --seeds {share} &")
-        rest = rest[share:]
+        out = folders[first].path if share == 1 else folders[first].path.parent
+        commands.append(f"  taskset -c {core} delayrl train … --seed {seeds[first]} --seeds {share} --out {out} &")
+        first += share
     if number > 3:
         commands[1:-1] = ["  …"]
-    first = f"seeds: {len(seeds)} share one process; {number} processes of one core each learn more in an hour:"
-    return "\n".join([first, *commands, "  or `delayrl bench run`, which does so by itself"])
+    line = f"seeds: {len(seeds)} share one process; {number} processes of one core each learn more in an hour:"
+    return "\n".join([line, *commands, "  or `delayrl bench run`, which does so by itself"])

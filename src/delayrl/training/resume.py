@@ -7,8 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
+from numpy.typing import NDArray
 
-from delayrl.agents.base import Schedule
+from delayrl.agents.base import Schedule, State
 from delayrl.core import replay as ring
 from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
@@ -19,7 +21,7 @@ from delayrl.run.folder import RunFolder
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
 from delayrl.training.cost import cost_of
-from delayrl.training.learner import Stored
+from delayrl.training.learner import Learner, Stored
 from delayrl.training.state import Group, TrainState
 
 COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
@@ -36,31 +38,29 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     """
     runs, config = group.folders, group.setup.config
     replaced = [run for run in runs if overwrite and run.exists and run.config]
-    for run in replaced:
-        run.remove()
     for run, seed in zip(runs, group.seeds, strict=True):
-        if run.exists and not group.further:
+        if run.exists and run not in replaced and not group.further:
             _check_same(run, config | {"seed": seed})
-        elif not run.exists and run not in replaced and not run.is_free:
+        elif not run.exists and not run.is_free:
             raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
-    checkpoints = _common_checkpoints(runs, note)
+    checkpoints = [] if replaced else _common_checkpoints(group, note)
+    state = restore(group, actors, checkpoints) if checkpoints else _fresh(group, actors, note)
+    for run in replaced:  # now that nothing can be refused any more
+        run.remove()
     config |= {"configuration": group.setup.configuration, "versions": versions()}
     if not all(run.exists for run in runs):
         config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
     for run, seed in zip(runs, group.seeds, strict=True):
         if not run.exists:
             run.create(config | {"seed": seed})
-    learner = group.program.init(group.keys, group.replay_rows)
-    state = TrainState(0, learner, actors, [], None, [{} for _ in runs], [(0, 0) for _ in runs])
     if not checkpoints:
         for run in runs:
             run.rewind(-1)
-        return _from_source(group, state, note) if group.source else state
+        return state
     newest = checkpoints[0]
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
-    state = restore(group, state, checkpoints)
-    for run in runs:  # now that nothing can be refused any more
+    for run in runs:
         if run.config["schedule"]["steps"] != group.setup.schedule.steps:
             run.extend(run.config | group.setup.config | {"configuration": group.setup.configuration})
         run.rewind(newest.step)
@@ -83,16 +83,23 @@ def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], C
     return stored if same else described, checkpoint
 
 
-def _from_source(group: Group, state: TrainState, note: Callable[[str], None]) -> TrainState:
-    """Return a fresh state with the networks of another run, as far as they fit. Raises DelayRLError if none does."""
-    assert group.source is not None
-    agent, arrays = state.learner.agent, group.source.arrays("agent")
+def _fresh(group: Group, actors: list[Actor], note: Callable[[str], None]) -> TrainState:
+    """Return the state in which a run begins, with the networks of another run as far as they fit, if there is one."""
+    learner = group.program.init(group.keys, group.replay_rows)
+    if group.source is not None:
+        learner = learner._replace(agent=_taken_over(learner.agent, group.source, note))
+    return TrainState(0, learner, actors, [], None, [{} for _ in actors], [(0, 0) for _ in actors])
+
+
+def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:
+    """Return a fresh agent with the networks of another run that fit. Raises DelayRLError if none does."""
+    arrays = source.arrays("agent")
     fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
     inner = {name.removeprefix("reference."): array for name, array in arrays.items()}  # a reference is an agent itself
     arrays = {f"reference.{name}": array for name, array in inner.items()} | inner | arrays
     taken, left = fitting(fresh, arrays)
     if not taken:
-        where = group.source.path.parents[1]
+        where = source.path.parents[1]
         raise DelayRLError(f"{where} has no network that fits: it lacks {', '.join(left)}, or has them in other sizes")
     note(f"taken over: {', '.join(taken)}; new: {', '.join(left) or 'no network'}, and the optimisers")
     names = [name for name in fresh if "opt_state" not in name and part_of(name) in taken]
@@ -101,8 +108,7 @@ def _from_source(group: Group, state: TrainState, note: Callable[[str], None]) -
         return jnp.broadcast_to(arrays[name], leaf.shape) if name in names else leaf
 
     leaves, form = jax.tree.flatten(agent)
-    agent = jax.tree.unflatten(form, [filled(leaf, name) for leaf, name in zip(leaves, fresh, strict=True)])
-    return replace(state, learner=state.learner._replace(agent=agent))
+    return jax.tree.unflatten(form, [filled(leaf, name) for leaf, name in zip(leaves, fresh, strict=True)])
 
 
 def fitting(fresh: Arrays, stored: Arrays) -> tuple[list[str], list[str]]:
@@ -125,21 +131,27 @@ def part_of(leaf: str) -> str:
     return ".".join(names[:first])
 
 
-def _common_checkpoints(runs: list[RunFolder], note: Callable[[str], None]) -> list[Checkpoint]:
-    """Return the newest checkpoint that all seeds have, for each; an empty list where a run begins."""
+def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Checkpoint]:
+    """Return the newest checkpoint that all seeds have, for each; an empty list where a run begins.
+
+    Raises:
+        DelayRLError: a seed has only broken checkpoints, or the seeds have none in common.
+    """
+    runs = group.folders
     good, broken = zip(*(run.checkpoints() for run in runs), strict=True)
     for line in (line for lines in broken for line in lines):
         note(line)
-    if any(good) and not all(good):
-        behind = ", ".join(str(run.path) for run, own in zip(runs, good, strict=True) if not own)
-        if any(len(own) > 1 or (own and own[0].complete) for own in good):
-            raise DelayRLError(f"{behind} cannot go on beside the other seeds; train those seeds alone")
     common = set.intersection(*({checkpoint.step for checkpoint in own} for own in good))
     if common:
         return [next(checkpoint for checkpoint in own if checkpoint.step == max(common)) for own in good]
     for run, lines in zip(runs, broken, strict=True):
         if lines:
             raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
+    steps = {own[0].step if own else 0 for own in good}
+    crashed = all(run.exists for run in runs) and all(len(own) < 2 for own in good)  # between the seeds' first ones
+    if any(good) and (group.further or not crashed or len(steps - {0}) > 1):
+        at = ", ".join(f"{run.path} at {own[0].step if own else 0:,}" for run, own in zip(runs, good, strict=True))
+        raise DelayRLError(f"the seeds stand at different steps ({at}); train these alone, or --overwrite them all")
     return []
 
 
@@ -147,6 +159,11 @@ def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
     """Raise DelayRLError if a folder holds a run with another configuration."""
     stored = run.config
     added_later = {**values_of(Schedule()), **OLDER}
+    if stored.get("origin", {}) != wanted.get("origin", {}):
+        raise DelayRLError(
+            f"{run.path} holds a run that began otherwise: with other networks, or shorter; give another --out, or "
+            "--overwrite"
+        )
     for key, value in wanted.items():
         if isinstance(value, dict):
             known = added_later | stored.get(key, {})
@@ -160,34 +177,36 @@ def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
             )
 
 
-def restore(group: Group, fresh: TrainState, checkpoints: list[Checkpoint]) -> TrainState:
+def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) -> TrainState:
     """Return the state in the seeds' checkpoints. Raises DelayRLError if one does not fit, or an episode differs."""
     states = [restore_tree(group.template, c.arrays("agent"), c.path) for c in checkpoints]
     agent = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
-    step = checkpoints[0].step
-    if step >= group.setup.schedule.steps:
-        return replace(fresh, step=step, learner=fresh.learner._replace(agent=agent))
+    step, shapes = checkpoints[0].step, jax.eval_shape(lambda: ring.init(group.spec, group.replay_rows))
+    columns = {name: np.zeros((len(actors), *x.shape), x.dtype) for name, x in shapes._asdict().items()}
+    if step >= group.setup.schedule.steps:  # it learns no more, and its replay stays empty
+        learner = Learner(agent, ring.Replay(**columns))  # type: ignore[arg-type]
+        return TrainState(step, learner, actors, [], None, [{} for _ in actors], [(0, 0) for _ in actors])
     loops = [checkpoint.arrays("loop") for checkpoint in checkpoints]
-    replays = []
     for i, (run, checkpoint, loop) in enumerate(zip(group.folders, checkpoints, loops, strict=True)):
-        columns = {name: np.array(column[i]) for name, column in fresh.learner.replay._asdict().items()}
+        own = {name: column[i] for name, column in columns.items() if name not in COUNTS}
         for piece in sorted(checkpoint.pieces):
             arrays = load_arrays(run.path / "replay" / piece)
-            if any(arrays[name].shape[1:] != columns[name].shape[1:] for name in ("obs", "action")):
+            if any(arrays[name].shape[1:] != own[name].shape[1:] for name in ("obs", "action")):
                 raise DelayRLError(f"{run.path} was trained on a task of other sizes than {group.setup.task}")
-            _paste(columns, arrays)
-        replays.append(ring.Replay(**(columns | {name: loop[name] for name in COUNTS})))  # type: ignore[arg-type]
-        actor = fresh.actors[i]
+            _paste(own, arrays)
+        for name in COUNTS:
+            columns[name][i] = loop[name]
+        actor = actors[i]
         actor.replay_episode(int(loop["episode"]), loop["actions"])
         if not np.array_equal(actor.truth, loop["truth"]):
             env = group.setup.condition.env
             raise DelayRLError(f"{env} does not repeat an episode from its seed, so the run cannot be resumed")
-    replay = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *replays)
+    replay = ring.Replay(**{name: jnp.asarray(columns.pop(name)) for name in ring.Replay._fields})
     pending = [_pending(loop) for loop in loops]
     return TrainState(
         step,
-        fresh.learner._replace(agent=agent, replay=replay),
-        fresh.actors,
+        Learner(agent, replay),
+        actors,
         [list(seeds) for seeds in zip(*pending, strict=True)],
         np.stack([loop["chosen"] for loop in loops]) if "chosen" in loops[0] else None,
         [dict(checkpoint.pieces) for checkpoint in checkpoints],
@@ -259,11 +278,14 @@ def _loop_arrays(group: Group, state: TrainState, seed: int) -> Arrays:
 def _cut(replay: ring.Replay, seed: int, first: int, last: int, first_step: int, steps: int) -> Arrays:
     """Return rows first..last of one seed's ring, and the rows of its steps from `first_step` on."""
     capacity = replay.obs.shape[1]
-    index = np.arange(first, last + 1) % capacity
-    piece: Arrays = {name: np.asarray(getattr(replay, name)[seed, index]) for name in COLUMNS}
-    numbers = np.arange(max(first_step, steps - capacity), steps)
-    row_of = np.asarray(replay.row_of[seed, numbers % capacity])
-    return piece | {"rows": np.arange(first, last + 1), "steps": numbers, "row_of": row_of}
+    rows, numbers = np.arange(first, last + 1), np.arange(max(first_step, steps - capacity), steps)
+
+    def taken(column: Array, index: NDArray[np.int64]) -> NDArray[Any]:
+        padded = np.pad(index % capacity, (0, -len(index) % 4096))  # each length is another program
+        return np.asarray(column[seed, padded])[: len(index)]
+
+    piece: Arrays = {name: taken(getattr(replay, name), rows) for name in COLUMNS}
+    return piece | {"rows": rows, "steps": numbers, "row_of": taken(replay.row_of, numbers)}
 
 
 def _paste(columns: Arrays, piece: Arrays) -> None:

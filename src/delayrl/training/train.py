@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -145,7 +146,12 @@ def train_group(
     if device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     precision = PRODUCTS[setup.schedule.precision]
-    with ThreadPoolExecutor(threads) as pool, on_device(device), jax.default_matmul_precision(precision):
+    with ExitStack() as held:
+        for folder in folders:
+            held.enter_context(folder.hold())
+        pool = held.enter_context(ThreadPoolExecutor(threads))
+        held.enter_context(on_device(device))
+        held.enter_context(jax.default_matmul_precision(precision))
         privileged, rules = setup.agent.privileged, setup.protocol
         actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
@@ -160,6 +166,6 @@ def train_group(
         if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         state = start(group, actors, overwrite, note)
-        if state.step < setup.schedule.steps and (lines := shared(numbers, device)):
+        if state.step < setup.schedule.steps and (lines := shared(numbers, folders, device)):
             note(lines)
         run(group, state, note, progress=progress, track=track, callback=callback)

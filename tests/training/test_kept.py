@@ -1,0 +1,93 @@
+"""What is refused leaves every stored file as it was."""
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import delayrl
+from delayrl.run.folder import RunFolder
+from short_runs import train
+
+
+def stored(folder: Path) -> dict[str, str]:
+    """Return the checksum of each file."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def assert_refused(folder: Path, why: str, call: Callable[[], object]) -> None:
+    before = stored(folder)
+    with pytest.raises(delayrl.DelayRLError, match=why):
+        call()
+    assert stored(folder) == before
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seeds, one finished and one stopped after its first evaluation."""
+    out = tmp_path_factory.mktemp("apart")
+    train("random", out / "seed0", seed=0)
+    train("random", out / "seed1", seed=1, callback=lambda step, runs: True)
+    return out
+
+
+def test_seeds_at_different_steps_do_not_begin_again(apart: Path) -> None:
+    why = "different steps .*seed0 at 300, .*seed1 at 100"
+    assert_refused(apart, why, lambda: train("random", apart, seeds=2))
+    assert_refused(apart, why, lambda: delayrl.go_on(apart, 600, progress=False))
+    assert train("random", apart / "seed1", seed=1).rows()[-1]["step"] == 300
+    assert [run.rows()[-1]["step"] for run in train("random", apart, seeds=2)] == [300, 300]
+
+
+def test_a_seed_that_is_new_does_not_restart_the_others(tmp_path: Path) -> None:
+    train("random", tmp_path / "seed0", callback=lambda step, runs: True)
+    assert_refused(tmp_path, "seed0 at 100, .*seed1 at 0", lambda: train("random", tmp_path, seeds=2))
+    assert not (tmp_path / "seed1").exists()
+
+
+def test_a_refused_overwrite_keeps_the_run(tmp_path: Path) -> None:
+    old = train("bpql", tmp_path / "old", steps=101)
+    other = train("random", tmp_path / "other", steps=101)
+    why = "no network that fits"
+    assert_refused(tmp_path, why, lambda: train("bpql", old.path, start_from=other, overwrite=True))
+    (tmp_path / "seed1").mkdir()
+    (tmp_path / "seed1" / "notes.txt").write_text("mine")
+    shutil.copytree(old.path, tmp_path / "seed0")
+    assert_refused(tmp_path, "seed1 is not empty", lambda: train("bpql", tmp_path, seeds=2, overwrite=True))
+
+
+def test_a_run_may_begin_with_its_own_networks(tmp_path: Path) -> None:
+    old = train("bpql", tmp_path, steps=101)
+    networks = RunFolder(tmp_path).latest().files["agent.safetensors"]
+    new = train("bpql", tmp_path, steps=102, start_from=old, overwrite=True)
+    assert new.config["origin"]["from"]["networks"] == networks
+    assert new.rows()[-1]["step"] == 102
+
+
+def test_a_run_that_began_with_other_networks_is_another(tmp_path: Path) -> None:
+    old = train("bpql", tmp_path / "old", steps=101)
+    train("bpql", tmp_path / "new", steps=101, start_from=old)
+    assert_refused(tmp_path, "began otherwise", lambda: train("bpql", tmp_path / "new", steps=101))
+    assert_refused(tmp_path, "began otherwise", lambda: train("bpql", old.path, steps=101, start_from=tmp_path / "new"))
+    delayrl.go_on(old, 103, progress=False)
+    assert_refused(tmp_path, "began otherwise", lambda: train("bpql", old.path, steps=103))
+
+
+def test_a_run_is_trained_by_one_process(tmp_path: Path) -> None:
+    run = train("random", tmp_path / "seed0")
+    with RunFolder(run.path).hold():
+        assert_refused(tmp_path, "trained by another process", lambda: train("random", run.path))
+        assert_refused(tmp_path, "trained by another process", lambda: train("random", tmp_path, seeds=2))
+        assert_refused(tmp_path, "trained by another process", lambda: delayrl.go_on(run, 400, progress=False))
+    assert train("random", run.path).rows() == run.rows()
+
+
+def test_what_is_refused_leaves_no_folder(tmp_path: Path) -> None:
+    source = train("random", tmp_path / "source", steps=101)
+    (tmp_path / "file").write_text("mine")
+    for out, why in ((tmp_path / "a" / "b", "no network that fits"), (tmp_path / "file", "not a run folder")):
+        assert_refused(tmp_path, why, lambda out=out: train("bpql", out, start_from=source))
+    assert {path.name for path in tmp_path.iterdir()} == {"source", "file"}
