@@ -1,6 +1,7 @@
 """Rows of a grid and the published table: none lost, none twice, with the versions that made them."""
 
 import json
+import shutil
 import sqlite3
 import subprocess
 from dataclasses import replace
@@ -153,6 +154,12 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
     collect(grid, runs, file)
     with pytest.raises(delayrl.DelayRLError, match="the table of the grid 'mixed'"):
         collect(Grid("other", "", grid.source, grid.cells), runs, file)
+    with pytest.raises(delayrl.DelayRLError, match=r"has \d+ rows, and below .* are only \d+; give another --out"):
+        shutil.copytree(runs, tmp_path / "fewer")
+        shutil.rmtree(tmp_path / "fewer" / grid.cells[0].folder / "seed1")
+        before = file.read_bytes()
+        collect(grid, tmp_path / "fewer", file)
+    assert file.read_bytes() == before
     with pytest.raises(delayrl.DelayRLError, match="has no rows"):
         collect(grid, tmp_path / "elsewhere", tmp_path / "none.sqlite")
     assert not (tmp_path / "none.sqlite").exists()
@@ -183,7 +190,7 @@ def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
         file.write(line + "\n")
     alone = Grid("alone", "", Path("alone.toml"), (cell,))
     for what in (lambda: collect(alone, runs, tmp_path / "t.sqlite"), lambda: list(rows_of([cell], runs))):
-        with pytest.raises(delayrl.DelayRLError, match=r"seed0 holds a damaged row: ") as error:
+        with pytest.raises(delayrl.DelayRLError, match=r"rows.jsonl holds a damaged row: ") as error:
             what()
         assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == []

@@ -16,7 +16,7 @@ import delayrl
 from delayrl.bench import folders
 from delayrl.bench.backends.local import LocalBackend
 from delayrl.bench.grid import load_grid
-from delayrl.bench.runner import run_cells
+from delayrl.bench.runner import Completion, run_cells
 from delayrl.bench.status import line, seconds_left, standing
 from delayrl.bench.worker import Outcome
 from delayrl.cli.bench import idle, seconds
@@ -339,6 +339,20 @@ def test_time_left(tmp_path: Path) -> None:
     assert seconds_left(now, 2) == pytest.approx(100 / 7.5)  # the longest cell alone
     assert seconds_left([(some[0], Progress("todo", 0))], 1) is None
     assert seconds_left(now[:1], 1) == 0
+
+
+def test_a_failed_cell_does_not_hide_those_that_are_left(tmp_path: Path, capsys, monkeypatch) -> None:
+    """The status says that the same command goes on."""
+    file = tiny(tmp_path)
+    failed, left = load_grid(file).cells
+    ended = Completion(failed={failed.id: "no"}, unfinished=[left])
+    monkeypatch.setattr("delayrl.bench.runner.run_cells", lambda *_, **__: ended)
+    with pytest.raises(SystemExit) as stopped:
+        main(["bench", "run", str(file), "--runs", str(tmp_path / "runs")])
+    assert stopped.value.code == 75
+    out, err = capsys.readouterr()
+    assert "the same command resumes it" in out
+    assert "1 of 2 cells failed, the first: no" in err
 
 
 def test_a_small_grid_is_told_how_to_use_all_workers() -> None:

@@ -31,6 +31,7 @@ def test_script(tmp_path: Path) -> None:
     grid = load_grid(tiny(tmp_path))
     text = script(grid, grid.cells, tmp_path / "my runs", time_limit=600, options=["--partition=gpu"])
     assert "#SBATCH --array=0-1\n" in text
+    assert "#SBATCH --array=0-1%3\n" in script(grid, grid.cells, tmp_path, workers=3)
     assert "#SBATCH --partition=gpu\n" in text
     assert "#SBATCH --requeue\n" in text
     assert f"cells=({' '.join(grid.ids)})" in text

@@ -1,5 +1,6 @@
 """Options of dataclasses: named, checked, rebuilt."""
 
+import numpy as np
 import pytest
 
 from delayrl.agents.registry import AGENTS
@@ -20,5 +21,8 @@ def test_older_runs_of_every_preset() -> None:
         for preset in entry.presets.values():
             older = {name: value for name, value in OLDER.items() if name in values_of(preset.agent)}
             assert values_of(override(preset.agent, OLDER)) == values_of(preset.agent) | older
+    numbers = {"tokens": np.int64(3), "learning_rate": np.float32(0.5)}
+    changed = values_of(override(AGENTS["vdpo"].presets["small"].agent, numbers))
+    assert (changed["tokens"], changed["learning_rate"]) == (3, 0.5)
     with pytest.raises(DelayRLError, match=r"^tokens must lie in 0 \.\. inf; got -1$"):
         override(AGENTS["vdpo"].presets["small"].agent, {"tokens": -1})

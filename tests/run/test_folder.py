@@ -19,7 +19,9 @@ LOOP = {"rows": np.int32(1)}
 @pytest.fixture
 def run(tmp_path: Path) -> RunFolder:
     run = RunFolder(tmp_path / "run")
-    run.create({"agent": "sac", "preset": "small", "env": "E", "delay": 0, "hyperparameters": {}, "schedule": {}})
+    run.create(
+        {"agent": "sac", "preset": "small", "env": "E", "delay": 0, "hyperparameters": {}, "schedule": {"steps": 300}}
+    )
     run.save(100, WEIGHTS, LOOP, {})
     return run
 
@@ -66,7 +68,8 @@ def test_a_damaged_manifest_is_one_line(damage: dict, words: str, run: RunFolder
     assert [checkpoint.step for checkpoint in good] == [100]
     assert words in line
     run.drop_pieces()
-    assert run.latest().step == 100
+    networks_are_intact = isinstance(damage.get("pieces"), dict)  # which is all that play takes
+    assert run.latest().step == (200 if networks_are_intact else 100)
 
 
 def test_a_copy_of_a_checkpoint_is_left_out(run: RunFolder) -> None:
@@ -83,3 +86,24 @@ def test_a_damaged_configuration_is_one_line(name: str, run: RunFolder) -> None:
     (run.path / "config.json").write_text(json.dumps({key: value for key, value in config.items() if key != name}))
     with pytest.raises(DelayRLError, match=f"no {name}"):
         print(run.config)
+
+
+def test_a_schedule_without_steps_is_damaged(run: RunFolder) -> None:
+    (run.path / "config.json").write_text(json.dumps(run.config | {"schedule": {}}))
+    with pytest.raises(DelayRLError, match=r"config.json is damaged: its schedule has no steps$"):
+        print(run.config)
+
+
+def test_a_damaged_row_is_one_line(run: RunFolder) -> None:
+    (run.path / "rows.jsonl").write_text("{}\n")
+    with pytest.raises(DelayRLError, match=r"rows.jsonl holds a damaged row: \{\}$"):
+        run.read("rows")
+
+
+def test_play_needs_no_replay(run: RunFolder) -> None:
+    """An unfinished run that was copied without it has a policy, but cannot be resumed."""
+    run.save(200, WEIGHTS, LOOP, {"piece": run.save_piece("piece", WEIGHTS)})
+    assert [checkpoint.step for checkpoint in run.checkpoints()[0]] == [200, 100]
+    shutil.rmtree(run.path / "replay")
+    assert run.latest().step == 200
+    assert [checkpoint.step for checkpoint in run.checkpoints()[0]] == [100]

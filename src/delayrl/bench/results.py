@@ -20,7 +20,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.disk import draft
 from delayrl.run.folder import RunFolder
-from delayrl.run.rows import EPISODE, Row, check_row, name_configuration
+from delayrl.run.rows import EPISODE, Row, name_configuration
 
 SCHEMA = 1
 TABLES = """
@@ -42,12 +42,8 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
     """Yield the rows of cells, each with its cell's id, from run folders. Raises DelayRLError for a damaged row."""
     for cell in cells:
         for path in folders.seed_folders(runs / cell.folder, cell.seeds):
-            for row in _read_rows(path):
+            for row in name_configuration(RunFolder(path).read("rows")):
                 yield row | {"cell": cell.id}
-
-
-def _read_rows(path: Path) -> list[Row]:
-    return name_configuration([check_row(row, path) for row in RunFolder(path).read("rows")])
 
 
 def collect(grid: Grid, runs: Path, out: Path) -> int:
@@ -56,9 +52,11 @@ def collect(grid: Grid, runs: Path, out: Path) -> int:
     Raises:
         DelayRLError: no rows yet, a damaged run, a row that is there twice, `out` is the table of another grid.
     """
+    before = 0
     if out.exists():
         with _open(out) as table:
             name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
+            before = table.execute("SELECT COUNT(*) FROM rows").fetchone()[0]
         if name != grid.name:
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
     if next(rows_of(grid.cells, runs), None) is None:
@@ -66,7 +64,11 @@ def collect(grid: Grid, runs: Path, out: Path) -> int:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with draft(out, shared=True) as file, contextlib.closing(sqlite3.connect(file)) as table:
-            return _fill(table, grid, runs)
+            count = _fill(table, grid, runs)
+            if count < before:  # run folders are gone, or elsewhere
+                fewer = f"{out} has {before:,} rows, and below {runs} are only {count:,}"
+                raise DelayRLError(f"{fewer}; give another --out")
+            return count
     except (OSError, sqlite3.OperationalError) as error:
         raise DelayRLError(f"cannot write {out}: {error}") from error
 
@@ -90,7 +92,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
 
 def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, later: list[dict[str, Any]]) -> int:
     """Insert a run and its rows, if it has any. Returns their number."""
-    rows = _read_rows(path)
+    rows = name_configuration(RunFolder(path).read("rows"))
     if not rows:
         return 0
     config = dict(RunFolder(path).config)
@@ -175,7 +177,7 @@ def _open(file: Path) -> Iterator[sqlite3.Connection]:
     except (sqlite3.Error, ValueError, KeyError, TypeError, DelayRLError) as error:
         raise DelayRLError(f"{file} is no table of results, or damaged: {error}") from error
     other = version[0] if version else "none"
-    raise DelayRLError(f"{file} has schema version {other}, this program reads {SCHEMA}: collect it again")
+    raise DelayRLError(f"{file} has schema version {other}, this program reads {SCHEMA}: collect into another file")
 
 
 def _json(value: Any) -> str:

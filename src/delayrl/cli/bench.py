@@ -122,7 +122,8 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
         _write_slurm(grid, cells, given)
         return
     backend, workers = _backend(given, grid)
-    if given.backend == "local" and (words := idle([c for c in cells if status(c, given.runs) != "done"], workers)):
+    begun = any(folders.stored(given.runs / cell.folder, cell.seeds)[0] for cell in cells)
+    if given.backend == "local" and not begun and (words := idle(cells, workers)):
         print(words, file=sys.stderr)
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
     with stop_signal() as stop:
@@ -133,14 +134,20 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     if completion.failed:
         first = next(iter(completion.failed.values()))
         count = f"{len(completion.failed)} of {len(cells)} cells failed"
-        raise DelayRLError(f"{count}, the first: {first} (`delayrl bench status` lists all)")
+        failure = f"{count}, the first: {first} (`delayrl bench status` lists all)"
+        if not completion.unfinished:
+            raise DelayRLError(failure)
+        print(failure, file=sys.stderr)
     if completion.unfinished:
         print("stopped at a checkpoint; the same command resumes it")
         sys.exit(STOPPED)
 
 
 def idle(cells: Sequence[Cell], workers: int) -> str:
-    """Return how a grid with fewer cells than workers would keep all of them busy, or ""."""
+    """Return how a grid with fewer cells than workers would keep all of them busy, or "".
+
+    Only before anything is stored: `lockstep` is part of a cell's id, so another one begins anew.
+    """
     runs = sum(len(cell.seeds) for cell in cells)
     if not len(cells) < min(workers, runs):
         return ""
@@ -170,7 +177,8 @@ def _write_slurm(grid: Grid, cells: Sequence[Cell], given: argparse.Namespace) -
         print(f"{grid.name}: all {len(cells)} cells are done")
         return
     words = ["--tries", str(given.tries), "--workers", "1", *(["--device", given.device] if given.device else [])]
-    text = slurm.script(grid, left, given.runs, time_limit=given.time_limit, options=given.sbatch, arguments=words)
+    limits = {"time_limit": given.time_limit, "workers": given.workers}
+    text = slurm.script(grid, left, given.runs, **limits, options=given.sbatch, arguments=words)
     file = slurm.write(grid, left, given.runs, text)
     print(f"{file}: {len(left)} cells")
     print(f"submitted as job {slurm.submit(file)}" if given.submit else f"next: sbatch {file}")

@@ -15,7 +15,6 @@ from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import RunFolder, RunLike, path_of
 from delayrl.run.provenance import versions
-from delayrl.run.rows import check_row
 
 
 def export_run(
@@ -109,8 +108,7 @@ def describe(run: RunFolder, step: int, longest: int, task: Task) -> dict[str, A
 
 def _evaluation(run: RunFolder, step: int) -> dict[str, Any] | None:
     """Summarise the last evaluation up to the checkpoint at `step`; None if there was none."""
-    rows = [check_row(row, run.path / "rows.jsonl") for row in run.read("rows")]
-    rows = [row for row in rows if row["policy"] == "agent" and row["step"] <= step]
+    rows = [row for row in run.read("rows") if row["policy"] == "agent" and row["step"] <= step]
     if not rows:
         return None
     last = max(row["step"] for row in rows)

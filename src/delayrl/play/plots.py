@@ -13,7 +13,7 @@ COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
 
 def curve(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw the learning curve of a run: the mean and the range of each evaluation's returns, against steps."""
+    """Draw the learning curve of a run: the mean and the range of each whole evaluation's returns, against steps."""
     if not rows:
         return
     returns: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -23,7 +23,9 @@ def curve(rows: list[dict[str, Any]], path: Path) -> None:
     with _axes(path) as axes:
         for policy, points in returns.items():
             label = f"{first['agent']}, delay {first['delay']}" if policy == "agent" else "its reference, no delay"
-            _band(axes, sorted(points), [points[step] for step in sorted(points)], COLOURS[policy], label)
+            whole = max(map(len, points.values()))
+            steps = sorted(step for step, played in points.items() if len(played) == whole)
+            _band(axes, steps, [points[step] for step in steps], COLOURS[policy], label)
         axes.set(xlabel="environment steps", ylabel="return", title=f"{first['env']}, seed {first['seed']}")
         axes.legend(frameon=False)
 
@@ -46,7 +48,7 @@ def curves(groups: Sequence[tuple[str, NDArray[Any], NDArray[Any]]], path: Path,
         axes.legend(frameon=False)
 
 
-def _band(axes: Any, x: list[float], values: Sequence[Any], colour: str, label: str) -> None:
+def _band(axes: Any, x: Sequence[float], values: Sequence[Any], colour: str, label: str) -> None:
     axes.plot(x, [np.mean(v) for v in values], color=colour, label=label, marker="o", markersize=3)
     low, high = [np.min(v) for v in values], [np.max(v) for v in values]
     axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)

@@ -58,12 +58,14 @@ class RowGroup:
         return sum(len(evaluation.episodes) for curve in self.curves.values() for evaluation in curve.values())
 
     def runs(self, policy: str) -> dict[int, dict[int, float]]:
-        """Return the mean return of a policy by seed and step."""
-        return {
-            seed: {step: evaluation.total / len(evaluation.episodes) for step, evaluation in curve.items()}
-            for (name, seed), curve in self.curves.items()
-            if name == policy
-        }
+        """Return the mean return of a policy by seed and step, without evaluations that a crash cut off."""
+        runs = {}
+        for (name, seed), curve in self.curves.items():
+            whole = max(len(evaluation.episodes) for evaluation in curve.values())
+            if name == policy:
+                means = {step: e.total / len(e.episodes) for step, e in curve.items() if len(e.episodes) == whole}
+                runs[seed] = means
+        return runs
 
 
 def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:

@@ -37,15 +37,12 @@ class Checkpoint:
 
         return load_arrays(self.path / f"{name}.safetensors")
 
-    def check(self, *, further: bool = False) -> None:
-        """Raise DelayRLError if a file that it needs is cut or changed.
-
-        A complete run needs its replay only to be trained `further`.
-        """
-        replay = self.path.parents[1] / "replay"
-        pieces = {} if self.complete and not further else self.pieces
+    def check(self, *, replay: bool) -> None:
+        """Raise DelayRLError if a file is cut or changed: its own, which play needs, or those of its replay too."""
+        folder = self.path.parents[1] / "replay"
+        pieces = self.pieces if replay else {}
         for name, checksum in (self.files | pieces).items():
-            file = (replay if name in pieces else self.path) / name
+            file = (folder if name in pieces else self.path) / name
             if Path(name).name != name or "\0" in name or _checksum(file) != checksum:
                 raise DelayRLError(f"{name} is cut or changed")
 

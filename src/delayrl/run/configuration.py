@@ -37,6 +37,8 @@ class Option:
 
     def check(self, value: Any) -> Any:
         """Return the value in this option's type. Raises DelayRLError if it does not fit."""
+        if getattr(value, "ndim", None) == 0:  # a number of NumPy's
+            value = value.item()
         if get_origin(self.kind) is Literal:
             if value not in get_args(self.kind):
                 raise DelayRLError(f"{self.name} must be one of {', '.join(get_args(self.kind))}; got {value!r}")

@@ -25,6 +25,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, save_arrays
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
 from delayrl.run.disk import disk_errors, draft, lock, remove, write_file, write_flushed
+from delayrl.run.rows import check_row
 
 FORMAT = 1
 NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
@@ -67,6 +68,8 @@ class RunFolder:
         for name, kind in CONFIG.items():
             if not isinstance(config, dict) or not isinstance(config.get(name), kind):
                 raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
+        if not isinstance(config["schedule"].get("steps"), int):
+            raise DelayRLError(f"{file} is damaged: its schedule has no steps")
         if config["format"] != FORMAT:
             raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
         return config  # type: ignore[no-any-return]
@@ -118,9 +121,10 @@ class RunFolder:
         file = self.path / f"{name}.jsonl"
         try:
             lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
-            return [json.loads(line) for line in lines if line.endswith("\n")]
+            rows = [json.loads(line) for line in lines if line.endswith("\n")]
         except (ValueError, RecursionError) as error:
             raise DelayRLError(f"{file} is damaged: {error}") from error
+        return [check_row(row, file) for row in rows] if name == "rows" else rows
 
     def extend(self, config: Mapping[str, Any]) -> None:
         """Replace the configuration by one of a longer run, and its hash in all rows."""
@@ -141,23 +145,31 @@ class RunFolder:
                     _delete_checkpoint(later)
 
     def checkpoints(self) -> tuple[list[Checkpoint], list[str]]:
-        """Return the good checkpoints, newest first, and one line for each broken one."""
+        """Return the checkpoints from which training can resume, newest first, and one line for each broken one.
+
+        One of a complete run needs no replay for that.
+        """
         good, broken = [], []
         for path in checkpoint_folders(self.path):
             try:
                 checkpoint = read_checkpoint(path)
-                checkpoint.check()
+                checkpoint.check(replay=not checkpoint.complete)
                 good.append(checkpoint)
             except (OSError, DelayRLError) as error:
                 broken.append(f"checkpoint {path} is broken ({error}); it is left out")
         return good, broken
 
     def latest(self) -> Checkpoint:
-        """Return the newest good checkpoint. Raises DelayRLError if there is none."""
-        good, broken = self.checkpoints()
-        if not good:
-            raise DelayRLError(broken[0] if broken else f"{self.path} has no checkpoint yet")
-        return good[0]
+        """Return the newest checkpoint whose networks are intact. Raises DelayRLError if there is none."""
+        broken = []
+        for path in checkpoint_folders(self.path):
+            try:
+                checkpoint = read_checkpoint(path)
+                checkpoint.check(replay=False)
+                return checkpoint
+            except (OSError, DelayRLError) as error:
+                broken.append(f"checkpoint {path} is broken ({error})")
+        raise DelayRLError(broken[0] if broken else f"{self.path} has no checkpoint yet")
 
     def save(
         self, step: int, agent: Arrays, loop: Arrays | None, pieces: dict[str, str], *, complete: bool = False

@@ -100,7 +100,8 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
 
 def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], steps: int) -> None:
     """Raise DelayRLError unless a run can go on to `steps` steps beside the first of its group."""
-    checkpoint = run.latest()
+    good, _ = run.checkpoints()
+    checkpoint = good[0] if good else run.latest()
     if steps < max(checkpoint.step, config["schedule"]["steps"]):
         least = max(checkpoint.step, config["schedule"]["steps"])
         raise DelayRLError(f"{run.path} has {least:,} steps; to train it further, give more than that: got {steps:,}")
@@ -111,7 +112,7 @@ def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], 
                 f"{run.path} was trained with --slim, or by an older version, and keeps no replay; {hint}"
             )
         try:
-            checkpoint.check(further=True)
+            checkpoint.check(replay=True)
         except (OSError, DelayRLError) as error:
             raise DelayRLError(f"{run.path} has lost a part of its replay ({error}); {hint}") from error
     own, others = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))

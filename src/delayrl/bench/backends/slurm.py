@@ -21,7 +21,7 @@ from delayrl.run.disk import disk_errors
 
 SCRIPT = """#!/bin/bash
 #SBATCH --job-name=delayrl-{name}
-#SBATCH --array=0-{last}
+#SBATCH --array=0-{last}{at_a_time}
 #SBATCH --time={minutes}
 #SBATCH --signal=B:TERM@{before}
 #SBATCH --requeue
@@ -52,13 +52,14 @@ def script(
     runs: Path,
     *,
     time_limit: float | None = None,
+    workers: int | None = None,
     options: Sequence[str] = (),
     arguments: Sequence[str] = (),
 ) -> str:
     """Return the text of an sbatch script with one element for each cell. The nodes must share the folder `runs`.
 
-    An element stops and requeues itself after `time_limit` seconds (default: an hour). `options` go into `#SBATCH`
-    lines, e.g. "--partition=gpu"; `arguments` go to `delayrl bench run`.
+    At most `workers` elements run at a time. An element stops and requeues itself after `time_limit` seconds (default:
+    an hour). `options` go into `#SBATCH` lines, e.g. "--partition=gpu"; `arguments` go to `delayrl bench run`.
 
     Raises:
         DelayRLError: an option that is none.
@@ -74,6 +75,7 @@ def script(
     return SCRIPT.format(
         name=grid.name,
         last=len(cells) - 1,
+        at_a_time="" if workers is None else f"%{workers}",
         minutes=math.ceil((limit + before) / 60),
         before=before,
         log=runs.resolve() / "slurm" / f"{grid.name}-%a.log",
