@@ -154,10 +154,10 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
     collect(grid, runs, file)
     with pytest.raises(delayrl.DelayRLError, match="the table of the grid 'mixed'"):
         collect(Grid("other", "", grid.source, grid.cells), runs, file)
+    shutil.copytree(runs, tmp_path / "fewer")
+    shutil.rmtree(tmp_path / "fewer" / grid.cells[0].folder / "seed1")
+    before = file.read_bytes()
     with pytest.raises(delayrl.DelayRLError, match=r"has \d+ rows, and below .* are only \d+; give another --out"):
-        shutil.copytree(runs, tmp_path / "fewer")
-        shutil.rmtree(tmp_path / "fewer" / grid.cells[0].folder / "seed1")
-        before = file.read_bytes()
         collect(grid, tmp_path / "fewer", file)
     assert file.read_bytes() == before
     with pytest.raises(delayrl.DelayRLError, match="has no rows"):
