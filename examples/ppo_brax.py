@@ -33,11 +33,16 @@ VIEWS = {
     "augmented": {"augment": True, "value": "state"},
     "privileged": {"augment": True, "value": "privileged_state"},
 }
+OURS = (
+    "backend",
+    "hidden",
+)  # options that are not PPO's: physics, and the widths of the policy's and the value's layers
 PPO = {"num_timesteps": 1_000_000, "discounting": 0.97, "learning_rate": 3e-4, "normalize_observations": True}
 TASKS: dict[str, dict[str, Any]] = {
     "inverted_pendulum": {  # of brax's notebook, with fewer robots and smaller batches
         **PPO,
         "backend": "positional",  # "spring" is faster, but PPO does not learn this task there, delayed or not
+        "hidden": ((32,) * 4, (256,) * 5),
         "num_envs": 512,
         "unroll_length": 5,
         "batch_size": 256,
@@ -49,6 +54,7 @@ TASKS: dict[str, dict[str, Any]] = {
     "halfcheetah": {  # few robots and many updates: a million steps are enough
         **PPO,
         "backend": "spring",
+        "hidden": ((128, 128), (128, 128)),
         "num_envs": 64,
         "unroll_length": 16,
         "batch_size": 8,
@@ -58,7 +64,6 @@ TASKS: dict[str, dict[str, Any]] = {
         "reward_scaling": 1,
     },
 }
-HIDDEN = {"policy_hidden_layer_sizes": (128, 128), "value_hidden_layer_sizes": (128, 128)}
 
 if not hasattr(jax, "device_put_replicated"):  # brax 0.14 calls what JAX 0.10 has removed
 
@@ -85,11 +90,16 @@ def learn(given: argparse.Namespace, view: str, seed: int) -> list[dict[str, Any
     train.train(
         envs.get_environment(given.task, backend=options["backend"]),
         num_evals=given.evaluations,
-        network_factory=partial(networks.make_ppo_networks, value_obs_key=VIEWS[view]["value"], **HIDDEN),
+        network_factory=partial(
+            networks.make_ppo_networks,
+            policy_hidden_layer_sizes=options["hidden"][0],
+            value_hidden_layer_sizes=options["hidden"][1],
+            value_obs_key=VIEWS[view]["value"],
+        ),
         wrap_env_fn=partial(wrap, delay=given.delay, augment=VIEWS[view]["augment"]),
         deterministic_eval=True,
         progress_fn=evaluated,
-        **{name: value for name, value in options.items() if name != "backend"},
+        **{name: value for name, value in options.items() if name not in OURS},
     )
     return rows
 

@@ -35,7 +35,6 @@ except ModuleNotFoundError:
     Env = object
 needs_brax = pytest.mark.skipif(Env is object, reason="brax is not installed")
 ROBOTS, STEPS = 3, 18
-TIGHT = {"rtol": 1e-6}  # a division of small numbers
 
 
 class Journal(Env):
@@ -98,22 +97,37 @@ def play(env: Any, steps: int = STEPS) -> tuple[Any, Any, np.ndarray]:
 
 
 @needs_brax
-@pytest.mark.parametrize(("text", "limit"), [("2+action=1", 9), ("3", 5), ("action=2", 9), ("0", 9)])
+@pytest.mark.parametrize(
+    ("text", "limit"),
+    [
+        ("2+action=1", 9),
+        ("3", 5),
+        ("action=2", 9),
+        ("0", 9),
+        ("uniform:2:2@fifo+action=episode:1:1", 9),
+        ("episode:3:3@raw+action=uniform:2:2", 9),
+        ("choice:3=1+action=recorded:1,1,@raw", 5),
+    ],
+)
 def test_equals_delayed_over_several_episodes(text: str, limit: int) -> None:
-    """Observation, vector, truth, reward and end, with episodes that end (7) and that are cut (5)."""
+    """Observation, vector, truth, reward and end, with episodes that end (7) and that are cut (5).
+
+    The random laws here draw the same travel time every time.
+    """
     first, states, actions = play(wrap(Journal(), text, episode_length=limit))
     for robot in range(ROBOTS):
         place = float(first.obs["privileged_state"][robot, 2])
         env = AugmentedObservation(Delayed(TimeLimit(Same(7, place), limit), text))
         vector, _ = env.reset(seed=0)
-        np.testing.assert_allclose(first.obs["state"][robot], vector, **TIGHT)
+        np.testing.assert_array_equal(first.obs["state"][robot], vector)
         for t in range(STEPS):
             vector, reward, terminated, truncated, info = env.step(actions[t, robot])
             assert bool(states.done[t, robot]) == (terminated or truncated)
+            assert bool(states.info["truncation"][t, robot]) == truncated, "PPO bootstraps there"
             assert states.reward[t, robot] == reward
             if terminated or truncated:
                 vector, info = env.reset()
-            np.testing.assert_allclose(states.obs["state"][t, robot], vector, **TIGHT)
+            np.testing.assert_array_equal(states.obs["state"][t, robot], vector)
             np.testing.assert_array_equal(states.obs["privileged_state"][t, robot], info["truth"])
 
 
@@ -136,6 +150,7 @@ def test_ranges_per_robot_and_randomised_dynamics() -> None:
     gains = jnp.array([1.0, 2.0, 3.0])
     delay = replace(as_batched("0"), observation=per_episode([0, 1, 3], [0, 2, 3]))
     env = wrap(Journal(), delay, episode_length=6, randomization_fn=lambda sys: (gains, 0))
+    assert env.observation_size == {"state": (3 + 3 * 1 + 1,), "privileged_state": (3,)}
     first, states, _ = play(env, 60)
     late = states.obs["privileged_state"][..., 0] - states.obs["state"][..., 0]
     ages = np.rint(states.obs["state"][..., -1] * 3)
@@ -158,9 +173,7 @@ def test_named_entries_are_delayed_and_others_are_not() -> None:
         "joints": (ROBOTS, 2 + 2 * 1 + 1),
         "map": (ROBOTS, 2, 2),
     }
-    assert {name: tuple(shape) for name, shape in env.observation_size.items()} == {
-        name: entry.shape[1:] for name, entry in first.obs.items()
-    }
+    assert env.observation_size == {name: entry.shape[1:] for name, entry in first.obs.items()}
     np.testing.assert_array_equal(states.obs["map"][:, 0, 0, 0], [1, 2, 3, 4, 5])
     np.testing.assert_array_equal(states.obs["time"][:, 0, 0], [0, 0, 1, 2, 3])
     np.testing.assert_array_equal(states.obs["joints"][2:, 0, 0], actions[:3, 0, 0])
@@ -173,6 +186,7 @@ def test_named_entries_are_delayed_and_others_are_not() -> None:
 def test_a_blind_agent_sees_the_observation_alone() -> None:
     first, states, _ = play(wrap(Journal(), "2+action=1", episode_length=9, augment=False), 4)
     assert first.obs["state"].shape == (ROBOTS, 3)
+    assert wrap(Journal(), "2", augment=False).observation_size == {"state": (3,), "privileged_state": (3,)}
     np.testing.assert_array_equal(states.obs["state"][:, 0, 0], [0, 0, 1, 2])
 
 
@@ -181,6 +195,8 @@ def test_action_repeat_counts_decisions() -> None:
     """Two steps of the task for each decision: 80 ms of 40 ms steps are one decision."""
     env = wrap(Journal(), "80ms", episode_length=20, action_repeat=2)
     assert env.delay.maximum == 1
+    assert wrap(Journal(), "80ms", step_seconds=0.02).delay.maximum == 4
+    assert DelayWrapper(training.wrap(Journal(), 9), "80ms", step_seconds=0.04).delay.maximum == 2
     _, states, _ = play(env, 3)
     np.testing.assert_array_equal(states.obs["state"][:, 0, 0], [0, 2, 4])
     np.testing.assert_array_equal(states.obs["privileged_state"][:, 0, 0], [2, 4, 6])
@@ -194,8 +210,20 @@ def test_bad_input() -> None:
         (lambda: training.wrap(wrap(Journal(), "1"), 9).reset(keys), "around the wrapper for training, not inside"),
         (lambda: wrap(Journal(), "1").reset(keys[0]), "around the wrapper for training, not inside"),
         (lambda: DelayWrapper(training.VmapWrapper(Journal()), "1").reset(keys), "that reset themselves"),
+        (lambda: DelayWrapper(Journal(), "1").reset(keys), "around the wrapper for training"),
+        (lambda: wrap(training.wrap(Journal(), 9), "1"), "not wrapped for training, .*; got EpisodeWrapper"),
+        (lambda: wrap(wrap(Journal(), "1"), "1"), "not wrapped for training, .*; got DelayWrapper"),
+        (
+            lambda: DelayWrapper(wrap(Journal(named=True), "1", keys=("time",)), "1", keys=("joints",)).reset(keys),
+            "already",
+        ),
+        (lambda: DelayWrapper(training.wrap(Journal(), 9), "80ms"), "give steps, or pass step_seconds"),
+        (lambda: wrap(Journal(), "1", keys=("time", "time")), "keys are different entries"),
+        (lambda: wrap(Journal(), "1", keys=("privileged_state",)), "not privileged_state, which is the truth"),
+        (lambda: named(keys="legs").reset(keys), r"got keys=\('legs',\)"),
         (lambda: wrap(Journal(), "9", episode_length=8), r"9 steps is longer than an episode \(8 decisions\)"),
         (lambda: wrap(Journal(), "5", episode_length=8, action_repeat=2), "longer than an episode .4 decisions"),
+        (lambda: wrap(Journal(), "6", episode_length=9, action_repeat=2), "longer than an episode .5 decisions"),
         (lambda: wrap(Journal(), "1+reward=2"), "cannot wait for one: delay observations and actions"),
         (lambda: wrap(gym.make("Pendulum-v1"), "1"), "brax's interface .*; got"),
         (lambda: named().reset(keys), r"a dict of joints, map, time; got keys=\(\)"),
@@ -252,6 +280,23 @@ def test_a_task_of_mujoco_playground() -> None:
     """Its own wrapper for training goes inside, and its truth is what it shows without a delay."""
     registry = pytest.importorskip("mujoco_playground").registry
     task = registry.load("CartpoleBalance", config_overrides={"impl": "jax"})
-    first, states, _ = play(wrap(task, "2+action=1", episode_length=10), 4)
+    env = wrap(task, "2+action=1", episode_length=4)
+    first, states, _ = play(env, 6)
     assert first.obs["state"].shape == (ROBOTS, 5 + 3 + 1)
-    np.testing.assert_array_equal(states.obs["state"][2:, :, :5], states.obs["privileged_state"][:2])
+    assert env.observation_size == {"state": (5 + 3 + 1,), "privileged_state": (5,)}
+    np.testing.assert_array_equal(states.obs["state"][2:3, :, :5], states.obs["privileged_state"][:1])
+    assert states.done[:, 0].tolist() == [0, 0, 0, 1, 0, 0]
+    np.testing.assert_array_equal(states.obs["state"][3:, :, :5], states.obs["privileged_state"][[3, 3, 3]])
+    np.testing.assert_allclose(states.obs["state"][3, :, 5:], [[0, 0, 0, 1 / 3]] * ROBOTS, rtol=1e-6)
+
+
+@needs_brax
+def test_a_task_built_on_mujoco_playground_gets_its_wrapper() -> None:
+    """Wherever the class of the task itself stands."""
+    from delayrl.batched.brax import _training_wrap
+
+    playground = pytest.importorskip("mujoco_playground")
+    cartpole = type(playground.registry.load("CartpoleBalance", config_overrides={"impl": "jax"}))
+    mine = object.__new__(type("Mine", (cartpole,), {"__module__": "mine"}))
+    assert _training_wrap(mine) is playground.wrapper.wrap_for_brax_training
+    assert _training_wrap(Journal()) is training.wrap

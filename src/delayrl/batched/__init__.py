@@ -1,6 +1,5 @@
 """Delays inside compiled simulators: the semantics of `delayrl.wrappers` as pure functions on arrays. Needs JAX."""
 
-from delayrl.batched.delay import BatchedChannel as BatchedChannel
 from delayrl.batched.delay import BatchedDelay as BatchedDelay
 from delayrl.batched.delay import as_batched as as_batched
 from delayrl.batched.delay import per_episode as per_episode

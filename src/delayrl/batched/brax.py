@@ -1,16 +1,15 @@
 """Delays for tasks of brax and MuJoCo Playground: `wrap` takes the place of their own wrapper for training."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from delayrl.batched.delay import BatchedDelay, as_batched
+from delayrl.batched.delay import BatchedLike, as_batched
 from delayrl.batched.episodes import Episode, act, arrive, restart, start
 from delayrl.batched.transit import Shown, augmented
-from delayrl.delays import DelayLike
 from delayrl.errors import DelayRLError
 
 try:
@@ -34,36 +33,45 @@ class Messages(NamedTuple):
 
 def wrap(
     env: Any,
-    delay: DelayLike | BatchedDelay,
+    delay: BatchedLike,
     episode_length: int = 1000,
     action_repeat: int = 1,
     randomization_fn: Callable[..., Any] | None = None,
     *,
     keys: Sequence[str] = (),
     augment: bool = True,
+    step_seconds: float | None = None,
     training_wrap: Callable[..., Any] | None = None,
 ) -> "DelayWrapper":
     """Wrap a task for training, with delays: give `partial(wrap, delay=...)` as `wrap_env_fn` of brax's PPO.
 
     Args:
         env: a task of brax or MuJoCo Playground, not wrapped for training.
-        delay: steps, a text ("uniform:1:3+action=2"), a `Delay` or a `BatchedDelay`. A step is one decision.
+        delay: what `as_batched` takes: steps, a text ("uniform:1:3+action=2") and so on. A step is one decision.
         episode_length: time limit, in steps of the task.
         action_repeat: steps of the task for each decision.
         randomization_fn: as for brax's wrapper.
         keys: as for `DelayWrapper`.
         augment: as for `DelayWrapper`.
+        step_seconds: the length of a decision, for delays in time; None for the task's `dt` times `action_repeat`.
         training_wrap: the wrapper for training that goes inside; None for the one of brax or MuJoCo Playground.
 
     Raises:
-        DelayRLError: no task of brax; a bad delay, or one that is longer than an episode.
+        DelayRLError: no task of brax, or one that is wrapped for training; a bad delay, or one that is longer than an
+            episode.
     """
     if not all(hasattr(env, name) for name in ("reset", "step", "action_size")):
         got = type(env).__name__
         raise DelayRLError(f"wrap takes a task with brax's interface (reset, step, action_size); got {got}")
+    for layer in _wrappers(env):
+        if "episode_length" in vars(layer) or isinstance(layer, DelayWrapper):
+            line = "wrap takes a task that is not wrapped for training, because it does that itself"
+            raise DelayRLError(f"{line}; got {type(layer).__name__}. Around such environments put DelayWrapper")
     seconds = getattr(env, "dt", None)
-    delay = as_batched(delay, None if seconds is None else float(seconds) * action_repeat)
-    longest, decisions = max(delay.maximum, delay.reward.maximum), episode_length // action_repeat
+    if step_seconds is None and seconds is not None:
+        step_seconds = float(seconds) * action_repeat
+    delay = as_batched(delay, step_seconds)
+    longest, decisions = max(delay.maximum, delay.reward.maximum), -(-episode_length // action_repeat)
     if longest > decisions:
         raise DelayRLError(f"a delay of {longest} steps is longer than an episode ({decisions} decisions)")
     inside = training_wrap or _training_wrap(env)
@@ -71,9 +79,16 @@ def wrap(
     return DelayWrapper(inside(env, **options), delay, keys=keys, augment=augment)
 
 
+def _wrappers(env: Any) -> Iterator[Any]:
+    """Yield the wrappers around a task, from outside to inside."""
+    while "env" in getattr(env, "__dict__", {}):
+        yield env
+        env = env.env
+
+
 def _training_wrap(env: Any) -> Callable[..., Any]:
     """Return the wrapper for training of the library that the task is from."""
-    if type(env).__module__.startswith("mujoco_playground."):
+    if any(kind.__module__.startswith("mujoco_playground.") for kind in type(getattr(env, "unwrapped", env)).__mro__):
         from mujoco_playground import wrapper
 
         return wrapper.wrap_for_brax_training
@@ -95,8 +110,9 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
     Args:
         env: environments with a leading axis that reset themselves, such as `brax.envs.training.wrap` returns.
         delay: as for `wrap`. A law whose arrays have a leading axis gives each environment its own.
-        keys: the entries that are delayed, of an observation that is a dict.
+        keys: the entries that are delayed, of an observation that is a dict. `privileged_state` has them in this order.
         augment: whether `state` has the actions and the age; False shows what an agent that knows no delay sees.
+        step_seconds: the length of a decision, for delays in time.
 
     Raises:
         DelayRLError: a bad delay, or one of the rewards; and, at the first reset, environments that do not reset
@@ -104,10 +120,19 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
     """
 
     def __init__(
-        self, env: Any, delay: DelayLike | BatchedDelay, *, keys: Sequence[str] = (), augment: bool = True
+        self,
+        env: Any,
+        delay: BatchedLike,
+        *,
+        keys: Sequence[str] = (),
+        augment: bool = True,
+        step_seconds: float | None = None,
     ) -> None:
         super().__init__(env)
-        self.delay, self._keys, self._augment = as_batched(delay), tuple(keys), augment
+        self.delay, self._augment = as_batched(delay, step_seconds), augment
+        self._keys = (keys,) if isinstance(keys, str) else tuple(keys)
+        if len(set(self._keys)) < len(self._keys) or "privileged_state" in self._keys:
+            raise DelayRLError(f"keys are different entries, and not privileged_state, which is the truth; got {keys}")
         if self.delay.reward.maximum:
             line = "rewards travel with terminations, and environments that reset themselves cannot wait for one"
             raise DelayRLError(f"{line}: delay observations and actions, or write the loop with delayrl.batched")
@@ -115,7 +140,7 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
 
     def reset(self, rng: jax.Array) -> State:
         """Start all episodes; `rng` has one key for each environment."""
-        if jax.random.key_data(rng).ndim != 2:
+        if jax.random.key_data(rng).ndim != 2 or not any(_wrappers(self.env)):
             line = "a delay goes around the wrapper for training, not inside"
             raise DelayRLError(f"{line}: give wrap_env_fn=partial(wrap, delay=...) to the training")
         state = self.env.reset(rng)
@@ -138,9 +163,15 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
 
     @property
     def observation_size(self) -> dict[str, Any]:
-        """The shape of each entry of the observation."""
-        state = jax.eval_shape(self.reset, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
-        return {name: entry.shape[1:] for name, entry in state.obs.items()}
+        """The shape of each entry of one environment's observation."""
+        obs = jax.eval_shape(self.env.unwrapped.reset, jax.random.PRNGKey(0)).obs
+        own = {key: obs[key].shape for key in self._keys} if self._keys else {"state": obs.shape}
+        sizes = {"privileged_state": (sum(size for (size,) in own.values()),)}
+        if self._augment and self.delay.maximum:
+            (first, (size,)), numbers = next(iter(own.items())), 1 if self.delay.action.rule == "wait" else 2
+            own[first] = (size + self.delay.maximum * self.action_size + numbers,)
+        others = {name: entry.shape for name, entry in obs.items()} if self._keys else {}
+        return {**sizes, **others, **own}
 
     def _late(self, obs: Any) -> jax.Array:
         """Return what is delayed of the task's observation, [N, S]."""
@@ -163,15 +194,17 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
         """Raise DelayRLError unless the environments can be delayed."""
         if not any(name.endswith("first_obs") for name in state.info):  # as all wrappers that reset name it
             raise DelayRLError("a delay goes around environments that reset themselves: use delayrl.batched.brax.wrap")
+        if NAME in state.info:
+            raise DelayRLError(f"the task has a delay already, or uses info[{NAME!r}] for something else")
         entries = dict(state.obs) if isinstance(state.obs, Mapping) else {"": state.obs}
         if set(self._keys or [""]) - set(entries):
             given = f"a dict of {', '.join(entries)}" if "" not in entries else "one array"
             line = "keys names what is delayed of an observation that is a dict"
             raise DelayRLError(f"{line}; here it is {given}; got keys={self._keys}")
         for key in self._keys or [""]:
-            if entries[key].ndim != 2:
-                shape = entries[key].shape[1:]
-                raise DelayRLError(f"observations must be flat vectors; {key or 'the task'} has the shape {shape}")
+            if getattr(entries[key], "ndim", None) != 2:
+                got = f"the shape {entries[key].shape[1:]}" if hasattr(entries[key], "shape") else "several parts"
+                raise DelayRLError(f"observations must be flat vectors; {key or 'the task'} has {got}")
         laws = zip(*(jax.tree.leaves(tree, is_leaf=_is_none) for tree in (self._axes, self.delay)), strict=True)
         for axis, array in laws:
             if axis == 0 and len(array) != count:

@@ -22,6 +22,8 @@ STATIC = {"static": True}
 class BatchedChannel:
     """A law, and the rule that says which message counts. Only the numbers of the law may change between calls.
 
+    `as_batched` and `per_episode` make it.
+
     Attributes:
         law: draws travel times; None if every message counts equally late.
         rule: as in `delayrl.delays`; `wait` if every message counts equally late.
@@ -53,11 +55,16 @@ class BatchedDelay:
         return BatchedDelay(*(BatchedChannel(axes(c.law), c.rule, c.maximum) for c in channels))
 
 
-def as_batched(delay: DelayLike | BatchedDelay, step_seconds: StepSeconds = None) -> BatchedDelay:
+BatchedLike = DelayLike | BatchedChannel | BatchedDelay
+"""What can stand for a delay of batched environments."""
+
+
+def as_batched(delay: BatchedLike, step_seconds: StepSeconds = None) -> BatchedDelay:
     """Convert what can stand for a delay to a `BatchedDelay`.
 
     Args:
-        delay: steps, a text ("uniform:1:3+action=2"), a law, or a `Delay`; a `BatchedDelay` is returned as it is.
+        delay: steps, a text ("uniform:1:3+action=2"), a law, or a `Delay`; a `BatchedDelay` is returned as it is, and a
+            channel, as `per_episode` makes it, is that of the observations.
         step_seconds: the length of an environment step, for texts with times.
 
     Raises:
@@ -65,6 +72,8 @@ def as_batched(delay: DelayLike | BatchedDelay, step_seconds: StepSeconds = None
     """
     if isinstance(delay, BatchedDelay):
         return delay
+    if isinstance(delay, BatchedChannel):
+        return BatchedDelay(delay)
     delay = as_delay(delay, step_seconds)
     return BatchedDelay(_channel(delay.observation), _channel(delay.action), _channel(delay.reward))
 
@@ -94,8 +103,14 @@ def per_episode(
     if isinstance(low, jax.core.Tracer) or isinstance(high, jax.core.Tracer):
         if maximum is None:
             raise DelayRLError("a delay whose range is computed in a compiled function has no bound: give maximum=")
-        return BatchedChannel(PerEpisode(Range(jnp.asarray(low), jnp.asarray(high))), "newest", whole_steps(maximum))
-    shortest, longest = np.asarray(low), np.asarray(high)
+        return _ranges(jnp.asarray(low), jnp.asarray(high), whole_steps(maximum))
+    try:
+        shortest, longest = np.asarray(low), np.asarray(high)
+        (shape,) = {x.shape for x in np.broadcast_arrays(shortest, longest)}
+    except ValueError:
+        shape = (0,)
+    if 0 in shape or len(shape) > 1:
+        raise DelayRLError(f"low and high are numbers, or lists of one for each environment; got {low} and {high}")
     for steps in {*shortest.ravel().tolist(), *longest.ravel().tolist()}:
         whole_steps(steps)
     if not (shortest <= longest).all():
@@ -103,5 +118,8 @@ def per_episode(
     bound = int(longest.max()) if maximum is None else whole_steps(maximum)
     if longest.max() > bound:
         raise DelayRLError(f"a range up to {longest.max()} steps is above its maximum of {bound}")
-    law = PerEpisode(Range(jnp.asarray(shortest, jnp.int32), jnp.asarray(longest, jnp.int32)))
-    return BatchedChannel(law, "newest", bound)
+    return _ranges(jnp.asarray(shortest, jnp.int32), jnp.asarray(longest, jnp.int32), bound)
+
+
+def _ranges(low: Array, high: Array, maximum: int) -> BatchedChannel:
+    return BatchedChannel(PerEpisode(Range(low, high)), "newest", maximum) if maximum else BatchedChannel()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
@@ -179,10 +180,15 @@ def augmented(delay: BatchedDelay, shown: Shown) -> Float[Array, " input"]:
     """
     if not delay.maximum:
         return shown.obs
-    parts = [shown.obs, shown.actions.reshape(-1), (shown.age / delay.maximum)[None]]
+    parts = [shown.obs, shown.actions.reshape(-1), _share(shown.age, delay.maximum)]
     if delay.action.rule != "wait":
-        parts.append((shown.applied / delay.action.maximum)[None])
+        parts.append(_share(shown.applied, delay.action.maximum))
     return jnp.concatenate(parts)
+
+
+def _share(age: Int[Array, ""], longest: int) -> Float[Array, "1"]:
+    """Return an age divided by the longest, from a table: a compiled division differs from NumPy's in the last bit."""
+    return jnp.asarray(np.arange(longest + 1) / longest, jnp.float32)[age][None]
 
 
 def _issued(transit: Transit, step: Int[Array, "*steps"]) -> Float[Array, "*steps action"]:
