@@ -5,10 +5,10 @@
 
 import argparse
 import json
-import os
 import runpy
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from figures import HERE, insert
@@ -18,14 +18,18 @@ VIEWS = ("blind", "augmented", "privileged")
 
 
 def collect(folders: list[Path]) -> None:
-    """Write the rows of run folders, and the versions that made them."""
-    import brax
-
-    from delayrl.run.provenance import versions
-
-    about = {"versions": versions() | {"brax": brax.__version__}, "cpus": os.cpu_count()}
-    rows = [line for folder in folders for line in (folder / "rows.jsonl").read_text().splitlines()]
-    ROWS.write_text("\n".join([json.dumps(about), *rows]) + "\n")
+    """Write the rows of run folders, after a line with the options of each task and the versions that made the rows."""
+    rows = [json.loads(line) for folder in folders for line in (folder / "rows.jsonl").read_text().splitlines()]
+    options: dict[str, dict[str, Any]] = {}
+    versions: list[dict[str, Any]] = []
+    for row in rows:
+        used = {name: value for name, value in row.pop("options").items() if name != "seed"}
+        if used != options.setdefault(row["task"], used):
+            raise SystemExit(f"{row['task']}: runs of other options are among these: {used} and {options[row['task']]}")
+        if (made := row.pop("versions")) not in versions:
+            versions.append(made)
+    lines = [{"options": options, "versions": versions}, *rows]
+    ROWS.write_text("\n".join(map(json.dumps, lines)) + "\n")
 
 
 def table() -> str:
@@ -44,10 +48,11 @@ def table() -> str:
         each = " · ".join(f"{value:,.0f}" for value in last)
         spread = [f"{x.mean():,.0f}" + (f" ± {x.std(ddof=1):,.0f}" if len(x) > 1 else "") for x in (last, mean)]
         lines.append(f"| {task} | {delay} | {steps:,} | {view} | {spread[0]} | {spread[1]} | {each} |")
-    used = about["versions"]
     longest = ", ".join(f"{task} {value / 60:.0f} min" for task, value in sorted(seconds.items()))
-    made = f"Longest run on a core of its own: {longest}. Made with brax {used['brax']}, jax {used['jax']}, "
-    made += f"{about['cpus']} x86 cores, commit {used['commit']}. Rows: `benchmarks/results/ppo.jsonl`."
+    used = about["versions"][0]
+    commits = ", ".join(sorted({made["commit"] for made in about["versions"]}))
+    made = f"Longest run, one process a core: {longest}. Made with brax {used['brax']}, jax {used['jax']}, "
+    made += f"{used['cores']} x86 cores, commit {commits}. Rows: `benchmarks/results/ppo.jsonl`."
     return "\n".join(lines) + f"\n\nEach return is the mean of 128 episodes with deterministic actions. {made}"
 
 

@@ -120,6 +120,9 @@ def test_what_needs_no_law() -> None:
     assert not jax.tree.leaves(delay)
     assert (delay.maximum, delay.action.maximum, delay.reward.maximum) == (5, 2, 4)
     assert as_batched(delay) is delay
+    assert as_batched(per_episode(1, 2)).observation.maximum == 2
+    none = replace(as_batched("2"), action=per_episode([0, 0], 0))
+    assert (none.action, none.maximum) == (as_batched("2").action, 2)
     assert as_batched("80ms", step_seconds=0.04).observation.maximum == 2
 
 
@@ -131,6 +134,9 @@ def test_bad_input() -> None:
         (lambda: per_episode([2, 3], [1, 4]), r"low ≤ high; got \[2, 3\] and \[1, 4\]"),
         (lambda: per_episode(-1, 2), "negative"),
         (lambda: per_episode(1, 2.5), "whole environment steps; got 2.5"),
+        (lambda: per_episode([0, 1], [2, 3, 4]), r"one for each environment; got \[0, 1\] and \[2, 3, 4\]"),
+        (lambda: per_episode([], []), "one for each environment"),
+        (lambda: per_episode([[0, 1]], [[2, 3]]), "one for each environment"),
         (lambda: per_episode(0, 7, maximum=6), "up to 7 steps is above its maximum of 6"),
     ):
         with pytest.raises(DelayRLError, match=words):
