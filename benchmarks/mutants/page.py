@@ -17,20 +17,21 @@ def text(mutants: list[Mutant], rows: dict[str, dict[str, Any]], older: set[str]
     survivors = [mutant for mutant in found if outcome[mutant.name] not in ("killed", "timeout")]
     killed = len(found) - len(survivors)
     dates, commits = ({rows[mutant.name][key] for mutant in found} for key in ("date", "commit"))
+    at = f", at commit {min(commits)}" if len(commits) == 1 else ""
     seconds = sum(rows[mutant.name]["seconds"] for mutant in found)
     parts = [
         "# Mutants\n",
         "A mutant is the code with one small mistake: a sign, a mask, an off-by-one, a target from the wrong network.\n"
         "`make mutants` runs the tests on every mutant of `benchmarks/mutants/list` and writes this page.\n"
         "[Contributing](contributing.md#mutants) says how to add one.\n",
-        f"**The tests kill {killed} of {len(found)} mutants** ({100 * killed / max(len(found), 1):.1f} %), on "
-        f"{' and '.join(sorted(dates))}, at commit {' and '.join(sorted(commits))}.\n"
+        f"**The tests killed {killed} of {len(found)} mutants** ({100 * killed / max(len(found), 1):.1f} %) when each was "
+        f"last tried, on {' and '.join(sorted(dates))}{at}.\n"
         f"Their tests took {seconds / 60:.0f} minutes, one after the other.\n",
     ]
     if len(found) < len(mutants):
         parts.append(f"{len(mutants) - len(found)} more mutants have no result yet.\n")
     if older:
-        parts.append(f"The mutated file or a test file of {len(older)} mutants has changed since their result.\n")
+        parts.append(f"Since then the mutated file or a test file of {len(older)} of them has changed.\n")
     rest = [f"| `{m.name}` | {m.breaks} | {m.survives or 'a test is missing'} |" for m in survivors]
     table = ["| mutant | what it breaks | why it survives |", "| --- | --- | --- |", *rest]
     parts.append("## Survivors\n\n" + ("\n".join(table) if rest else "None.") + "\n")
