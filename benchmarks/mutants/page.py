@@ -24,8 +24,8 @@ def text(mutants: list[Mutant], rows: dict[str, dict[str, Any]], older: set[str]
         "A mutant is the code with one small mistake: a sign, a mask, an off-by-one, a target from the wrong network.\n"
         "`make mutants` runs the tests on every mutant of `benchmarks/mutants/list` and writes this page.\n"
         "[Contributing](contributing.md#mutants) says how to add one.\n",
-        f"**The tests killed {killed} of {len(found)} mutants** ({100 * killed / max(len(found), 1):.1f} %) when each was "
-        f"last tried, on {' and '.join(sorted(dates))}{at}.\n"
+        f"**The tests killed {killed} of {len(found)} mutants** ({100 * killed / max(len(found), 1):.1f} %) "
+        f"when each was last tried, on {' and '.join(sorted(dates))}{at}.\n"
         f"Their tests took {seconds / 60:.0f} minutes, one after the other.\n",
     ]
     if len(found) < len(mutants):

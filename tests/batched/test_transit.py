@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from delayrl.batched import augmented
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
-from delayrl.batched.transit import Shown, Travel, begin, issue, receive, renew, show
+from delayrl.batched.transit import Shown, begin, issue, receive, renew, show
 from delayrl.delays import (
     Channel,
     Choice,
@@ -151,12 +151,12 @@ def play_batched(delay: BatchedDelay, lengths, truncates, limit, actions, travel
     def step(carry: Any, given: Any) -> Any:
         transit, episode, time = carry
         action, times = given
-        travel = Travel(*times)
-        transit, applied = issue(delay, transit, action, travel)
+        travel, action_travel, reward_travel = times
+        transit, applied = issue(delay, transit, action, action_travel)
         obs, reward = jnp.stack([time + 1.0, applied[0]]), 2.0**time
         end = time + 1 == lengths[episode]
         truncated = (end & truncates[episode]) | (time + 1 >= limit)
-        transit, now = receive(delay, transit, obs, reward, end & ~truncates[episode], truncated, travel)
+        transit, now = receive(delay, transit, obs, reward, end & ~truncates[episode], truncated, travel, reward_travel)
         done = now.terminated | now.truncated
         transit = renew(transit, fresh(episode + done), done)
         first = show(delay, transit, jnp.zeros(()), no, no)

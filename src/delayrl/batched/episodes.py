@@ -12,14 +12,22 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
 from delayrl.batched.laws import PerEpisode, draw
-from delayrl.batched.transit import Shown, Transit, Travel, begin, issue, receive, renew, show
+from delayrl.batched.transit import Shown, Transit, begin, issue, receive, renew, show
+
+
+class LawStates(NamedTuple):
+    """What each channel's law remembers from message to message."""
+
+    observation: Int[Array, ""]
+    action: Int[Array, ""]
+    reward: Int[Array, ""]
 
 
 class Episode(NamedTuple):
     """One environment's messages, the states of its laws, and the key of its next random numbers."""
 
     transit: Transit
-    laws: Travel
+    laws: LawStates
     key: PRNGKeyArray
 
 
@@ -39,12 +47,12 @@ def start(
     """
     key, now = jax.random.split(key)
     zero, channel = jnp.zeros((), jnp.int32), delay.action
-    lag, law = jnp.array(channel.maximum, jnp.int32), zero
+    lag, state = jnp.array(channel.maximum, jnp.int32), zero
     if isinstance(channel.law, PerEpisode):  # one delay for the episode, which the age counts
-        lag, law = _draw(channel, zero, now)
+        lag, state = _draw(channel, zero, now)
     transit = begin(delay, obs, idle, lag)
     no = jnp.zeros((), bool)
-    return Episode(transit, Travel(zero, law, zero), key), show(delay, transit, jnp.zeros(()), no, no)
+    return Episode(transit, LawStates(zero, state, zero), key), show(delay, transit, jnp.zeros(()), no, no)
 
 
 def act(
@@ -52,10 +60,9 @@ def act(
 ) -> tuple[Episode, Float[Array, " action"]]:
     """Issue an action. Returns the one that acts now, which the simulator takes."""
     key, now = jax.random.split(episode.key)
-    travel, law = _draw(delay.action, episode.laws.action, now)
-    laws = episode.laws._replace(action=law)
-    transit, applied = issue(delay, episode.transit, action, laws._replace(action=travel))
-    return Episode(transit, laws, key), applied
+    travel, state = _draw(delay.action, episode.laws.action, now)
+    transit, applied = issue(delay, episode.transit, action, travel)
+    return Episode(transit, episode.laws._replace(action=state), key), applied
 
 
 def arrive(
@@ -72,11 +79,10 @@ def arrive(
     its next episode before the agent is told, so an environment that resets itself takes no delay of the rewards.
     """
     key, first, second = jax.random.split(episode.key, 3)
-    observation, of_observation = _draw(delay.observation, episode.laws.observation, first)
-    arrival, of_reward = _draw(delay.reward, episode.laws.reward, second)
+    travel, of_observation = _draw(delay.observation, episode.laws.observation, first)
+    reward_travel, of_reward = _draw(delay.reward, episode.laws.reward, second)
     laws = episode.laws._replace(observation=of_observation, reward=of_reward)
-    travel = Travel(observation, jnp.zeros((), jnp.int32), arrival)
-    transit, shown = receive(delay, episode.transit, obs, reward, terminated, truncated, travel)
+    transit, shown = receive(delay, episode.transit, obs, reward, terminated, truncated, travel, reward_travel)
     return Episode(transit, laws, key), shown
 
 

@@ -1,6 +1,7 @@
 """One episode under a delay as pure functions on arrays: `wrappers/transit.py` for compiled simulators.
 
-The functions serve one environment; `jax.vmap` adds the axis. They take travel times as arguments and draw nothing.
+The functions serve one environment; `jax.vmap` adds the axis. They take travel times as arguments and draw nothing;
+those of channels with the rule `wait` are not read.
 All shapes follow from the longest delays. At step t the agent has issued u_0 .. u_{t-1}; s_0 counts as arrived at once.
 """
 
@@ -12,14 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from delayrl.batched.delay import BatchedChannel, BatchedDelay
-
-
-class Travel(NamedTuple):
-    """The travel times of the messages of one step. Those of channels with the rule `wait` are not read."""
-
-    observation: Int[Array, ""]
-    action: Int[Array, ""]
-    reward: Int[Array, ""]
 
 
 class Queue(NamedTuple):
@@ -104,12 +97,12 @@ def renew(transit: Transit, fresh: Transit, done: Bool[Array, ""]) -> Transit:
 
 
 def issue(
-    delay: BatchedDelay, transit: Transit, action: Float[Array, " action"], travel: Travel
+    delay: BatchedDelay, transit: Transit, action: Float[Array, " action"], travel: Int[Array, ""]
 ) -> tuple[Transit, Float[Array, " action"]]:
     """Issue an action. Returns the one that acts now."""
     now, applied = transit.time, action
     if delay.action.maximum:
-        queue = _send(delay.action, transit.action, now, travel.action)
+        queue = _send(delay.action, transit.action, now, travel)
         age = jnp.minimum(now - queue.newest, delay.action.maximum)
         applied = jnp.where(age > 0, _issued(transit, now - age), action)
         transit = transit._replace(action=queue, action_age=age)
@@ -123,13 +116,14 @@ def receive(
     reward: Float[Array, ""],
     terminated: Bool[Array, ""],
     truncated: Bool[Array, ""],
-    travel: Travel,
+    travel: Int[Array, ""],
+    reward_travel: Int[Array, ""],
 ) -> tuple[Transit, Shown]:
     """Take in the outcome of a step, and return what has arrived. Once the episode is over, only `truncated` counts."""
     slots = delay.observation.maximum + 1
     obs = jnp.where(transit.over, truth(transit), obs)
     time = transit.time + 1
-    queue = _send(delay.observation, transit.observation, time, travel.observation)
+    queue = _send(delay.observation, transit.observation, time, travel)
     transit = transit._replace(
         time=time,
         observation=queue._replace(newest=jnp.maximum(queue.newest, 0)),
@@ -137,7 +131,7 @@ def receive(
         applied=transit.applied.at[time % slots].set(transit.action_age),
     )
     if delay.reward.maximum:
-        transit, reward, terminated = _late(delay.reward, transit, reward, terminated, truncated, travel.reward)
+        transit, reward, terminated = _late(delay.reward, transit, reward, terminated, truncated, reward_travel)
     return transit, show(delay, transit, reward, terminated, truncated)
 
 
