@@ -47,6 +47,12 @@ def _sac(kind: str) -> Work:
     return Work(f"sac-{kind}", title, {"cpu": 100}, {"ours": ours("sac"), "peer": peer(kind)})
 
 
+def _any_age(delay: int) -> Work:
+    title = f"any-age, preset `small`, HalfCheetah-v5, Δ = {delay}; BPQL, ours too"
+    sides = {"ours": ours("any-age", "small", delay), "peer": ours("bpql", "small", delay)}
+    return Work(f"any-age-{delay}", title, {"cpu": 100}, sides)
+
+
 WORKS = {
     work.name: work
     for work in (
@@ -75,6 +81,7 @@ WORKS = {
             _vdpo(5) | {"ours": ours("vdpo", delay=5, seeds=10)},
         ),
         _sac("cleanrl"),
+        *(_any_age(delay) for delay in (25, 50)),
         Work("vdpo-25", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 25; released code", {"cpu": 10}, _vdpo(25)),
     )
 }

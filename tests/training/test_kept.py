@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import delayrl
-from delayrl.run.folder import RunFolder
+from delayrl.run.folder import RunFolder, hold
 from short_runs import train
 
 
@@ -78,7 +78,7 @@ def test_a_run_that_began_with_other_networks_is_another(tmp_path: Path) -> None
 
 def test_a_run_is_trained_by_one_process(tmp_path: Path) -> None:
     run = train("random", tmp_path / "seed0")
-    with RunFolder(run.path).hold():
+    with hold(run.path):
         assert_refused(tmp_path, "trained by another process", lambda: train("random", run.path))
         assert_refused(tmp_path, "trained by another process", lambda: train("random", tmp_path, seeds=2))
         assert_refused(tmp_path, "trained by another process", lambda: delayrl.go_on(run, 400, progress=False))

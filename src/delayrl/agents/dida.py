@@ -42,7 +42,9 @@ class DIDA:
     """The DIDA agent. The student's defaults are the released code's, the expert's are those of VDPO's reference."""
 
     reference: sac.SAC = field(default_factory=sac.SAC)
-    expert_steps: Annotated[int, "steps in which the expert learns and acts; a multiple of round_steps"] = 500_000
+    expert_steps: Annotated[int, "steps in which the expert learns and acts; a multiple of round_steps", "scales"] = (
+        500_000
+    )
     round_steps: Annotated[int, "environment steps in a round of aggregation, in which the student acts"] = 1000
     imitation_updates: Annotated[int, "student updates after each round, on fresh batches of all data"] = 1000
     student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)

@@ -17,11 +17,9 @@ from delayrl.envs import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, as_agent, find_agent
-from delayrl.run.configuration import OLDER, check_names, override, values_of
+from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.rows import CONDITION
 
-PARTS = ("lifting_hold", "lifting_end", "expert_steps")
-"""Options that are a part of the run, whatever its length."""
 GROWS: Mapping[str, Sequence[str]] = {
     "matched": ("replay_capacity", "evaluate_every"),
     "small": ("replay_capacity", "evaluate_every", "random_steps"),
@@ -163,7 +161,8 @@ def resolve(
 def following(name: str, preset: Preset, steps: int) -> dict[str, int]:
     """Return the options of the preset called `name` that are other numbers in a run of so many steps."""
     usual, length = {**values_of(preset.agent), **values_of(preset.schedule)}, preset.schedule.steps
-    names = (*PARTS, *(GROWS.get(name, ()) if steps > length else ()))
+    scaled = [option.name for option in options(preset.agent) if option.scales]
+    names = (*scaled, *(GROWS.get(name, ()) if steps > length else ()))
     return {name: -(-usual[name] * steps // length) for name in names if name in usual and steps != length}
 
 

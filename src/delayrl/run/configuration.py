@@ -34,6 +34,7 @@ class Option:
     default: Any
     help: str
     bounds: tuple[float, float] = (-math.inf, math.inf)
+    scales: bool = False  # whether a run of another length has it in proportion
 
     def check(self, value: Any) -> Any:
         """Return the value in this option's type. Raises DelayRLError if it does not fit."""
@@ -62,15 +63,16 @@ class Option:
 
 
 def options(config: Any) -> Iterator[Option]:
-    """Yield every option of a dataclass and of the dataclasses inside it, but not the fields marked `fixed`."""
+    """Yield every option of a dataclass and of the dataclasses inside it, but not the fields marked "fixed"."""
     hints = get_type_hints(type(config), include_extras=True)
     for field in fields(config):
         value, hint = getattr(config, field.name), hints[field.name]
         if is_dataclass(value):
             yield from options(value)
         elif get_origin(hint) is Annotated and get_args(hint)[1] != "fixed":
-            kind, words, *bounds = get_args(hint)
-            yield Option(field.name, kind, value, words, *bounds)
+            kind, words, *more = get_args(hint)
+            bounds = next((x for x in more if x != "scales"), Option.bounds)
+            yield Option(field.name, kind, value, words, bounds, "scales" in more)
 
 
 def override(config: Any, values: Mapping[str, Any]) -> Any:

@@ -81,22 +81,6 @@ class RunFolder:
             hint = f"; its runs are {below}" if below else ""
             raise DelayRLError(f"{self.path} is not a run folder: it has no config.json{hint}")
 
-    @contextlib.contextmanager
-    def hold(self) -> Iterator[None]:
-        """Keep the run for this process until the block ends. Raises DelayRLError if another process trains it."""
-        made = [path for path in (self.path, *self.path.parents) if not path.exists()]
-        with disk_errors(self.path), contextlib.suppress(FileExistsError):  # a file: it is refused later
-            self.path.mkdir(parents=True, exist_ok=True)
-        try:
-            with lock(self.path) as free:
-                if not free:
-                    raise DelayRLError(f"{self.path} is being trained by another process")
-                yield
-        finally:
-            for path in made:  # what was refused leaves nothing
-                with contextlib.suppress(OSError):
-                    path.rmdir()
-
     def create(self, config: Mapping[str, Any]) -> None:
         """Make the folder and write its configuration."""
         with disk_errors(self.path):
@@ -218,6 +202,23 @@ class RunFolder:
         abandoned = (self.path / "checkpoints").glob(".*draft")  # by a process that was killed
         for old in [*checkpoint_folders(self.path)[kept:], *abandoned]:
             shutil.rmtree(old, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Keep a run folder for this process until the block ends. Raises DelayRLError if another process trains it."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    with disk_errors(path), contextlib.suppress(FileExistsError):  # a file: it is refused later
+        path.mkdir(parents=True, exist_ok=True)
+    try:
+        with lock(path) as free:
+            if not free:
+                raise DelayRLError(f"{path} is being trained by another process")
+            yield
+    finally:
+        for folder in made:  # what was refused leaves nothing
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 def path_of(run: RunLike) -> Path:

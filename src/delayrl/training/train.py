@@ -22,7 +22,7 @@ from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup, resolve
-from delayrl.run.folder import RunFolder, RunLike, path_of
+from delayrl.run.folder import RunFolder, RunLike, hold, path_of
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.checks import check_fit, check_ways
@@ -148,7 +148,7 @@ def train_group(
     precision = PRODUCTS[setup.schedule.precision]
     with ExitStack() as held:
         for folder in folders:
-            held.enter_context(folder.hold())
+            held.enter_context(hold(folder.path))
         pool = held.enter_context(ThreadPoolExecutor(threads))
         held.enter_context(on_device(device))
         held.enter_context(jax.default_matmul_precision(precision))
