@@ -41,13 +41,14 @@ def table() -> str:
         curves[row["task"], row["delay"], row["view"]][row["seed"]][row["step"]] = row["return"]
         seconds[row["task"]] = max(seconds[row["task"]], row["seconds"])
     lines = ["| task | delay | steps | PPO | return | mean over training | each seed |", "|" + " --- |" * 7]
-    for task, delay, view in sorted(curves, key=lambda key: (key[0], VIEWS.index(key[2]))):
+    for task, delay, view in sorted(curves, key=lambda key: (key[0], key[1] != "0", VIEWS.index(key[2]))):
         seeds = [list(curve.values()) for curve in curves[task, delay, view].values()]
         last, mean = np.array([curve[-1] for curve in seeds]), np.array([np.mean(curve) for curve in seeds])
         steps = max(next(iter(curves[task, delay, view].values())))
         each = " · ".join(f"{value:,.0f}" for value in last)
         spread = [f"{x.mean():,.0f}" + (f" ± {x.std(ddof=1):,.0f}" if len(x) > 1 else "") for x in (last, mean)]
-        lines.append(f"| {task} | {delay} | {steps:,} | {view} | {spread[0]} | {spread[1]} | {each} |")
+        kind = view if delay != "0" else "no delay"
+        lines.append(f"| {task} | {delay} | {steps:,} | {kind} | {spread[0]} | {spread[1]} | {each} |")
     longest = ", ".join(f"{task} {value / 60:.0f} min" for task, value in sorted(seconds.items()))
     used = about["versions"][0]
     commits = ", ".join(sorted({made["commit"] for made in about["versions"]}))

@@ -1,0 +1,1 @@
+"""The base beside other libraries."""
