@@ -101,6 +101,7 @@ def learn(given: argparse.Namespace, view: str, seed: int) -> list[dict[str, Any
         progress_fn=evaluated,
         **{name: value for name, value in options.items() if name not in OURS},
     )
+    jax.clear_caches()  # or the programs of ten runs exhaust the process's memory maps
     return rows
 
 
