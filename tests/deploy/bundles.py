@@ -61,7 +61,7 @@ def run_of(path: Path, name: str = "vdpo", env: str = "Reacher-v5", delay: int =
     agent = AGENTS[name] if name in AGENTS else REGISTRY[name].presets["small"].agent
     run = RunFolder(path)
     described = {"agent": name, "preset": "small", "env": env, "delay": delay, "protocol": "corrected"}
-    described |= {"privileged": agent.privileged, "hyperparameters": values_of(agent), "schedule": {}}
+    described |= {"privileged": agent.privileged, "hyperparameters": values_of(agent), "schedule": {"steps": 1}}
     run.create(described | {"seed": 3, "versions": {"numpy": "2"}})
     rows = [
         {"step": step, "policy": policy, "episode": i, "reset_seed": i, "return": float(step + i), "length": 50}
