@@ -137,7 +137,8 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
     monkeypatch.setattr(Actor, "step", step)
     run = RunFolder(tmp_path / "cut")
     assert run.latest().step == at // 100 * 100
-    run.append("rows", [{"step": 299, "policy": "agent", "return": 0.0}])  # made after the checkpoint
+    # made after the checkpoint
+    run.append("rows", [{"step": 299, "policy": "agent", "episode": 0, "reset_seed": 0, "return": 0.0, "length": 1}])
     with open(run.path / "rows.jsonl", "a") as file:
         file.write('{"step": 299, "pol')
     resumed = train(agent, tmp_path / "cut", protocol=protocol, slim=True)
