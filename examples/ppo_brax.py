@@ -108,22 +108,22 @@ def learn(given: argparse.Namespace, view: str, seed: int) -> list[dict[str, Any
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw each seed's returns thinly, and the mean of a view where all its seeds were evaluated; grey: no delay."""
     tasks = sorted({(row["task"], row["delay"]) for row in rows if row["delay"] != "0"}) or [(rows[0]["task"], "0")]
-    figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks), 3.5), squeeze=False)
+    figure, axes = plt.subplots(1, len(tasks), figsize=(5 * len(tasks), 4), squeeze=False)
     for axis, (task, delay) in zip(axes[0], tasks, strict=True):
-        axis.set(title=f"{task}, delay {delay}", xlabel="steps", ylabel="return")
+        axis.set(title=f"{task}, delay {delay}", xlabel="million steps", ylabel="return")
         lines = [(delay, view, f"C{number}", view) for number, view in enumerate(VIEWS)]
         for late, view, colour, label in [*lines, ("0", "augmented", "grey", "no delay")]:
             curves: dict[int, dict[int, float]] = {}
             for row in rows:
                 if (row["task"], row["delay"], row["view"]) == (task, late, view):
-                    curves.setdefault(row["seed"], {})[row["step"]] = row["return"]
+                    curves.setdefault(row["seed"], {})[row["step"] / 1e6] = row["return"]
             for curve in curves.values():
                 axis.plot(curve.keys(), curve.values(), color=colour, alpha=0.3, linewidth=0.8)
             if curves:
                 steps = sorted(set.intersection(*map(set, curves.values())))
                 means = [np.mean([curve[step] for curve in curves.values()]) for step in steps]
                 axis.plot(steps, means, color=colour, label=f"{label} ({len(curves)} seeds)")
-        axis.legend()
+        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=2, frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=150)
 
