@@ -106,7 +106,7 @@ def per_episode(
         return _ranges(jnp.asarray(low), jnp.asarray(high), whole_steps(maximum))
     try:
         shortest, longest = np.asarray(low), np.asarray(high)
-        (shape,) = {x.shape for x in np.broadcast_arrays(shortest, longest)}
+        shape = np.broadcast_shapes(shortest.shape, longest.shape)
     except ValueError:
         shape = (0,)
     if 0 in shape or len(shape) > 1:

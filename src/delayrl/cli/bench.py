@@ -122,8 +122,8 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
         _write_slurm(grid, cells, given)
         return
     backend, workers = _backend(given, grid)
-    begun = any(folders.stored(given.runs / cell.folder, cell.seeds)[0] for cell in cells)
-    if given.backend == "local" and not begun and (words := idle(cells, workers)):
+    words = idle(cells, workers) if given.backend == "local" else ""
+    if words and not any(folders.stored(given.runs / cell.folder, cell.seeds)[0] for cell in cells):
         print(words, file=sys.stderr)
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
     with stop_signal() as stop:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from delayrl.run.rows import whole_evaluations
+
 COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
 
@@ -23,8 +25,7 @@ def curve(rows: list[dict[str, Any]], path: Path) -> None:
     with _axes(path) as axes:
         for policy, points in returns.items():
             label = f"{first['agent']}, delay {first['delay']}" if policy == "agent" else "its reference, no delay"
-            whole = max(map(len, points.values()))
-            steps = sorted(step for step, played in points.items() if len(played) == whole)
+            steps = whole_evaluations(points)
             _band(axes, steps, [points[step] for step in steps], COLOURS[policy], label)
         axes.set(xlabel="environment steps", ylabel="return", title=f"{first['env']}, seed {first['seed']}")
         axes.legend(frameon=False)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import RunFolder, RunLike, is_config, path_of, seed_folders
+from delayrl.run.rows import whole_evaluations
 
 if TYPE_CHECKING:  # they take JAX, and listing runs does not
     from delayrl.envs.task import TaskLike
@@ -79,8 +80,8 @@ class Run:
         for row in self.rows():
             if row["policy"] == policy:
                 returns.setdefault(row["step"], []).append(row["return"])
-        episodes = max(map(len, returns.values()), default=0)
-        steps = sorted(step for step, played in returns.items() if len(played) == episodes)
+        steps = whole_evaluations(returns)
+        episodes = len(returns[steps[0]]) if steps else 0
         table = np.array([returns[step] for step in steps]).reshape(len(steps), episodes)
         return Curve(np.array(steps, np.int64), table)
 

@@ -12,7 +12,7 @@ from typing import Any
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
 from delayrl.run.cost import Cost
-from delayrl.run.rows import CONDITION, CONFIGURATION, Row, name_configuration
+from delayrl.run.rows import CONDITION, CONFIGURATION, Row, name_configuration, whole_evaluations
 
 LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
 
@@ -27,6 +27,14 @@ class Evaluation:
 
     total: float = 0.0
     episodes: set[int] = field(default_factory=set)
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    @property
+    def mean(self) -> float:
+        """The mean return."""
+        return self.total / len(self)
 
 
 @dataclass
@@ -59,13 +67,11 @@ class RowGroup:
 
     def runs(self, policy: str) -> dict[int, dict[int, float]]:
         """Return the mean return of a policy by seed and step, without evaluations that a crash cut off."""
-        runs = {}
-        for (name, seed), curve in self.curves.items():
-            whole = max(len(evaluation.episodes) for evaluation in curve.values())
-            if name == policy:
-                means = {step: e.total / len(e.episodes) for step, e in curve.items() if len(e.episodes) == whole}
-                runs[seed] = means
-        return runs
+        return {
+            seed: {step: curve[step].mean for step in whole_evaluations(curve)}
+            for (name, seed), curve in self.curves.items()
+            if name == policy
+        }
 
 
 def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:

@@ -133,27 +133,29 @@ class RunFolder:
 
         One of a complete run needs no replay for that.
         """
-        good, broken = [], []
-        for path in checkpoint_folders(self.path):
-            try:
-                checkpoint = read_checkpoint(path)
-                checkpoint.check(replay=not checkpoint.complete)
-                good.append(checkpoint)
-            except (OSError, DelayRLError) as error:
-                broken.append(f"checkpoint {path} is broken ({error}); it is left out")
-        return good, broken
+        found = list(self._checked(replay=True))
+        lines = [f"{line}; it is left out" for line in found if isinstance(line, str)]
+        return [checkpoint for checkpoint in found if isinstance(checkpoint, Checkpoint)], lines
 
     def latest(self) -> Checkpoint:
         """Return the newest checkpoint whose networks are intact. Raises DelayRLError if there is none."""
         broken = []
-        for path in checkpoint_folders(self.path):
-            try:
-                checkpoint = read_checkpoint(path)
-                checkpoint.check(replay=False)
-                return checkpoint
-            except (OSError, DelayRLError) as error:
-                broken.append(f"checkpoint {path} is broken ({error})")
+        for found in self._checked(replay=False):
+            if isinstance(found, Checkpoint):
+                return found
+            broken.append(found)
         raise DelayRLError(broken[0] if broken else f"{self.path} has no checkpoint yet")
+
+    def _checked(self, *, replay: bool) -> Iterator[Checkpoint | str]:
+        """Yield the checkpoints, newest first, a line for a broken one; with the replay of unfinished ones or not."""
+        for path in checkpoint_folders(self.path):
+            found: Checkpoint | str
+            try:
+                found = read_checkpoint(path)
+                found.check(replay=replay and not found.complete)
+            except (OSError, DelayRLError) as error:
+                found = f"checkpoint {path} is broken ({error})"
+            yield found
 
     def save(
         self, step: int, agent: Arrays, loop: Arrays | None, pieces: dict[str, str], *, complete: bool = False

@@ -1,7 +1,7 @@
 """Rows: one for each evaluation episode, as a run folder's rows.jsonl holds them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Sized
 from typing import Any
 
 from delayrl.errors import DelayRLError
@@ -22,6 +22,12 @@ def check_row(row: Any, where: object) -> Row:
     if not typed or not math.isfinite(row["return"]):
         raise DelayRLError(f"{where} holds a damaged row: {str(row)[:200]}")
     return row
+
+
+def whole_evaluations(episodes: Mapping[int, Sized]) -> list[int]:
+    """Return the steps of a policy's evaluations, in order, but not of one that a crash cut: it has fewer episodes."""
+    most = max(map(len, episodes.values()), default=0)
+    return sorted(step for step, played in episodes.items() if len(played) == most)
 
 
 def name_configuration(rows: Sequence[Row]) -> list[Row]:

@@ -88,7 +88,12 @@ def _fresh(group: Group, actors: list[Actor], note: Callable[[str], None]) -> Tr
     learner = group.program.init(group.keys, group.replay_rows)
     if group.source is not None:
         learner = learner._replace(agent=_taken_over(learner.agent, group.source, note))
-    return TrainState(0, learner, actors, [], None, [{} for _ in actors], [(0, 0) for _ in actors])
+    return _nothing_stored(0, learner, actors)
+
+
+def _nothing_stored(step: int, learner: Learner, actors: list[Actor]) -> TrainState:
+    """Return the state at a step with no file of a replay."""
+    return TrainState(step, learner, actors, [], None, [{} for _ in actors], [(0, 0) for _ in actors])
 
 
 def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:
@@ -184,8 +189,7 @@ def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) ->
     step, shapes = checkpoints[0].step, jax.eval_shape(lambda: ring.init(group.spec, group.replay_rows))
     columns = {name: np.zeros((len(actors), *x.shape), x.dtype) for name, x in shapes._asdict().items()}
     if step >= group.setup.schedule.steps:  # it learns no more, and its replay stays empty
-        learner = Learner(agent, ring.Replay(**columns))  # type: ignore[arg-type]
-        return TrainState(step, learner, actors, [], None, [{} for _ in actors], [(0, 0) for _ in actors])
+        return _nothing_stored(step, Learner(agent, ring.Replay(**columns)), actors)  # type: ignore[arg-type]
     loops = [checkpoint.arrays("loop") for checkpoint in checkpoints]
     for i, (run, checkpoint, loop) in enumerate(zip(group.folders, checkpoints, loops, strict=True)):
         own = {name: column[i] for name, column in columns.items() if name not in COUNTS}
