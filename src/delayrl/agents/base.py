@@ -10,16 +10,13 @@ import optax
 from jaxtyping import Array, Int
 
 from delayrl.core.networks import Params
+from delayrl.core.precision import BFLOAT16
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import Sees
 
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 ObservationNorm = Literal["none", "running"]
-PRODUCTS: Mapping[Precision, str] = {
-    "float32": "float32",
-    "tensorfloat32": "tensorfloat32",
-    "bfloat16": "BF16_BF16_F32",  # JAX's "bfloat16" is bfloat16 on a TPU, but tensorfloat32 on a GPU
-}
+PRODUCTS: Mapping[Precision, str] = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": BFLOAT16}
 """Each precision as `jax.default_matmul_precision` names it."""
 State = Any
 """An agent's state: a pytree of arrays (networks, optimiser states, temperatures)."""

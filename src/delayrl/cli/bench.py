@@ -68,7 +68,9 @@ def run(given: argparse.Namespace) -> None:
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:
     for cell in grid.cells:
-        setup = f"preset {cell.condition.preset}, {cell.condition.steps:,} steps"
+        preset, steps, overrides = cell.condition.preset, cell.condition.steps, cell.condition.overrides
+        changed = [f"{name}={value}" for name, value in sorted(overrides.items()) if name != "steps"]
+        setup = ", ".join([f"preset {preset}", f"{steps:,} steps", *changed])
         print(f"{cell.id}  {status(cell, given.runs):<7}  {cell}, {setup}")
     runs = sum(len(cell.seeds) for cell in grid.cells)
     steps = sum(cell.condition.steps * len(cell.seeds) for cell in grid.cells)

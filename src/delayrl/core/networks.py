@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from delayrl.core.precision import product
 from delayrl.core.types import Key
 
 Params = Any
@@ -39,7 +40,7 @@ def linear(params: Params, x: Float[Array, "*batch inputs"]) -> Float[Array, "*b
     w, rows = params["w"], x.reshape(-1, x.shape[-1]) if x.ndim > 2 else x
     if x.ndim > 1 and len(rows) >= 4000 and len(rows) % 2 == 0:  # see docs/performance.md
         rows, w = rows.reshape(2, -1, rows.shape[1]), jnp.broadcast_to(w, (2, *w.shape))
-    return (rows @ w).reshape(*x.shape[:-1], -1) + params["b"]
+    return product(rows, w).reshape(*x.shape[:-1], -1) + params["b"]
 
 
 def layer_norm_init(width: int) -> Params:

@@ -1,0 +1,48 @@
+"""Matrix products in the precision of a run. XLA has bfloat16 on accelerators alone: on a CPU it is written out."""
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.layout import Layout, with_layout_constraint
+from jaxtyping import Array, Float
+
+BFLOAT16 = "BF16_BF16_F32"
+"""`jax.default_matmul_precision` of bfloat16 factors and float32 sums. JAX's "bfloat16" is tensorfloat32 on a GPU."""
+FEW = 32
+"""Fewer outputs (Q-values, means, log-stds) cost little, and stay in float32 on a CPU."""
+
+
+def product(x: Float[Array, "*rows inputs"], w: Float[Array, "*copies inputs outputs"]) -> Float[Array, "*rows _"]:
+    """Return X W in the precision that `jax.default_matmul_precision` asks for. W's leading axes are X's too."""
+    if jax.config.jax_default_matmul_precision != BFLOAT16 or w.shape[-1] < FEW:
+        return x @ w
+    return _rounded_product(jnp.atleast_2d(x), w).reshape(*x.shape[:-1], -1)
+
+
+@jax.custom_vjp
+def _rounded_product(x: Array, w: Array) -> Array:
+    return _contract(x, w, -1, -2)
+
+
+def _slopes(factors: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
+    x, w = factors
+    return _contract(slope, w, -1, -1), _contract(x, slope, -2, -2)
+
+
+_rounded_product.defvjp(lambda x, w: (_rounded_product(x, w), (x, w)), _slopes)
+
+
+def _contract(x: Array, y: Array, x_axis: int, y_axis: int) -> Array:
+    """Sum products of rounded factors over an axis of each, one of the last two; those before are batches."""
+    copies = tuple(range(x.ndim - 2))
+
+    def on_cpu(x: Array, y: Array) -> Array:
+        if x_axis == -2:  # XLA's fast product wants a left factor in the order of its rows (docs/performance.md)
+            x = with_layout_constraint(jnp.swapaxes(x, -1, -2), Layout(tuple(range(x.ndim))))
+        numbers = (((x.ndim - 1,), (y.ndim + y_axis,)), (copies, copies))
+        x, y = x.astype(jnp.bfloat16), y.astype(jnp.bfloat16)
+        return jax.lax.dot_general(x, y, numbers, jax.lax.Precision.DEFAULT, jnp.float32)
+
+    def elsewhere(x: Array, y: Array) -> Array:
+        return jax.lax.dot_general(x, y, (((x.ndim + x_axis,), (y.ndim + y_axis,)), (copies, copies)))
+
+    return jax.lax.platform_dependent(x, y, cpu=on_cpu, default=elsewhere)

@@ -1,0 +1,64 @@
+"""Products of rounded factors, forward and backward, beside NumPy's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from delayrl.core.networks import mlp, mlp_init
+from delayrl.core.precision import BFLOAT16, FEW, product
+
+SHAPES = [((40,), (40, 48)), ((24, 40), (40, 48)), ((2, 24, 40), (2, 40, 48))]
+
+
+def drawn(*shapes: tuple[int, ...]) -> list[np.ndarray]:
+    """Numbers that bfloat16 does not have."""
+    return [np.random.default_rng(i).normal(size=shape).astype(np.float32) for i, shape in enumerate(shapes)]
+
+
+def rounded(x: np.ndarray) -> np.ndarray:
+    return np.asarray(jnp.asarray(x).astype(jnp.bfloat16), np.float64)
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+@pytest.mark.parametrize(("rows", "weights"), SHAPES)
+def test_factors_are_rounded_and_sums_are_not(rows, weights, lockstep: bool) -> None:
+    """The result, and what a loss's slope is at both factors: each a product of two rounded arrays."""
+    x, w, slope = drawn(rows, weights, (*rows[:-1], weights[-1]))
+
+    def both(x, w, slope):
+        y, back = jax.vjp(product, x, w)
+        return y, *back(slope)
+
+    with jax.default_matmul_precision(BFLOAT16):
+        if lockstep:
+            seeds = (np.stack([a, 2 * a]) for a in (x, w, slope))
+            found = [pair[0] for pair in jax.jit(jax.vmap(both))(*seeds)]
+        else:
+            found = jax.jit(both)(x, w, slope)
+    x, w, slope = (rounded(a) for a in (x, w, slope))
+    x_2d, slope_2d = np.atleast_2d(x), np.atleast_2d(slope)
+    expected = [x @ w, slope @ np.swapaxes(w, -1, -2), np.swapaxes(x_2d, -1, -2) @ slope_2d]
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == jnp.float32
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-4)
+
+
+def test_other_precisions_and_few_outputs_are_float32() -> None:
+    """The same numbers as without a setting."""
+    x, w, few = drawn((24, 40), (40, FEW), (40, FEW - 1))
+    for precision, weights, same in ((BFLOAT16, w, False), (BFLOAT16, few, True), ("float32", w, True)):
+        with jax.default_matmul_precision(precision):
+            assert np.array_equal(jax.jit(product)(x, weights), jax.jit(jnp.matmul)(x, weights)) == same
+
+
+def test_gradient_of_a_network() -> None:
+    """Close to float32's and not equal to it."""
+    params = mlp_init(jax.random.key(0), (40, 64, 64, 3), norm="layer")
+    x = jnp.asarray(drawn((32, 40))[0])
+    slopes = []
+    for precision in ("float32", BFLOAT16):
+        with jax.default_matmul_precision(precision):
+            grad = jax.jit(jax.grad(lambda params: (mlp(params, x) ** 2).mean()))(params)
+        slopes.append(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(grad)]))
+    assert 1e-4 < np.linalg.norm(slopes[1] - slopes[0]) / np.linalg.norm(slopes[0]) < 0.1
