@@ -10,8 +10,10 @@ from matplotlib import pyplot
 
 from delayrl.report import statistics
 
-COLOURS = {"delayrl": "#1f6feb", "SBX": "#d1242f", "Stable-Baselines3": "#1a7f37", "delayrl, paper": "#8250df"}
-COLOURS["delayrl, small"] = "#9a6700"
+COLOURS = {"delayrl": "#1f6feb", "SBX": "#d1242f", "Stable-Baselines3": "#1a7f37", "delayrl, matched": "#8250df"}
+COLOURS |= {"delayrl, matched, bfloat16": "#c07ff0", "delayrl, small": "#9a6700"}
+BASE = {"delayrl, matched, bfloat16": "delayrl, matched"}
+"""With whom to compare, where it is not ours with the standard settings, "delayrl"."""
 PEERS = {"sbx": "SBX", "sb3": "Stable-Baselines3"}
 Runs = dict[str, dict[str, dict[int, dict[int, float]]]]  # task -> who -> seed -> step -> mean return
 
@@ -42,14 +44,19 @@ def name(config: dict[str, Any]) -> str:
     """Return who trained: a library, with the preset where it is not the standard settings."""
     if "library" in config:
         return PEERS[config["library"]]
+    words = ["delayrl"]
     if config["preset"] == "small":
-        return "delayrl, small"
-    return "delayrl" if config["hyperparameters"]["n_steps"] == 1 else "delayrl, paper"
+        words.append("small")
+    elif config["hyperparameters"]["n_steps"] > 1:  # preset paper too: its entropies were over [-1, 1] here
+        words.append("matched")
+    precision = config["schedule"].get("precision", "float32")
+    return ", ".join(words if precision == "float32" else [*words, precision])
 
 
 def table(runs: Runs) -> str:
-    """Return a Markdown table: final return and area by task and library, and how much larger our area is."""
-    head = ["task", "SAC of", "seeds", "mean return over training", "after training", "ours less theirs, 95 % interval"]
+    """Return a Markdown table: area and final return by task and library, and how much larger an area is."""
+    head = ["task", "SAC of", "seeds", "mean return over training", "after training"]
+    head.append("difference over training, 95 % interval")
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for task, by_name in sorted(runs.items()):
         areas = {}
@@ -57,7 +64,9 @@ def table(runs: Runs) -> str:
             steps, returns = statistics.common_steps([by_name[who][seed] for seed in sorted(by_name[who])])
             areas[who] = statistics.area(steps, returns)
             cells = [task, who, str(len(returns)), spread(areas[who]), spread(returns[:, -1])]
-            lines.append("| " + " | ".join([*cells, difference(areas.get("delayrl"), areas[who], who)]) + " |")
+            base = BASE.get(who, "delayrl")
+            compared = difference(areas[who], areas.get(base)) if who != "delayrl" else ""
+            lines.append("| " + " | ".join([*cells, compared and f"{compared} against {base}"]) + " |")
     return "\n".join(lines)
 
 
@@ -67,14 +76,14 @@ def spread(values: statistics.Floats) -> str:
     return f"{mean:,.0f}" + ("" if np.isnan(std) else f" ± {std:,.0f}")
 
 
-def difference(ours: statistics.Floats | None, theirs: statistics.Floats, who: str) -> str:
-    """Write the difference of the means with a bootstrap interval over the seeds of both."""
-    if ours is None or who == "delayrl" or min(ours.size, theirs.size) < 2:
+def difference(one: statistics.Floats, other: statistics.Floats | None) -> str:
+    """Write the difference of the means with a 95 % bootstrap interval over the seeds of both."""
+    if other is None or min(one.size, other.size) < 2:
         return ""
     random = np.random.default_rng(0)
-    drawn = [x[random.integers(x.size, size=(10_000, x.size))].mean(1) for x in (ours, theirs)]
+    drawn = [x[random.integers(x.size, size=(10_000, x.size))].mean(1) for x in (one, other)]
     low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5])
-    return f"{ours.mean() - theirs.mean():+,.0f} ({low:+,.0f} to {high:+,.0f})"
+    return f"{one.mean() - other.mean():+,.0f} ({low:+,.0f} to {high:+,.0f})"
 
 
 def draw(runs: Runs, out: Path) -> None:

@@ -53,6 +53,11 @@ def _any_age(delay: int) -> Work:
     return Work(f"any-age-{delay}", title, {"cpu": 100}, sides)
 
 
+def _bfloat16(name: str, title: str, steps: int, **side: Any) -> Work:
+    sides = {"ours": ours(**side, precision="bfloat16"), "peer": ours(**side)}
+    return Work(f"{name}-bfloat16", f"{title}, in bfloat16; in float32, ours too", {"cpu": steps}, sides)
+
+
 WORKS = {
     work.name: work
     for work in (
@@ -82,6 +87,8 @@ WORKS = {
         ),
         _sac("cleanrl"),
         *(_any_age(delay) for delay in (25, 50)),
+        _bfloat16("sac", "SAC, 256 × 256, batch 256, HalfCheetah-v5", 100, agent="sac"),
+        _bfloat16("vdpo-5", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5", 10, agent="vdpo", delay=5),
         Work("vdpo-25", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 25; released code", {"cpu": 10}, _vdpo(25)),
     )
 }
