@@ -10,7 +10,7 @@ import numpy as np
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
-from speed.works import SIZES
+from speed.works import OWN, SIZES
 
 from delayrl.bench.results import read_table
 
@@ -24,11 +24,10 @@ def read_rows(name: str = "speed") -> list[Row]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def compared(rows: list[Row]) -> str:
-    """Return a Markdown table of ours beside each peer."""
-    lines = [
-        *head("work; peer|device|threads|ours, steps/s|peer, steps/s|ratio (quartiles)|of processor time|slices|load"),
-    ]
+def compared(rows: list[Row], names: tuple[str, str] = ("ours", "peer")) -> str:
+    """Return a Markdown table of both sides of each work, by default ours beside each peer."""
+    sides = f"work; {names[1]}|device|threads|{names[0]}, steps/s|{names[1]}, steps/s"
+    lines = head(f"{sides}|ratio (quartiles)|of processor time|slices|load")
     for row in (r for r in rows if not r["work"].startswith("size-")):
         cells = [row["title"], row["device"], row["threads"], f"{row['ours']['steps_per_second']:.1f}"]
         if "peer" in row:
@@ -288,12 +287,13 @@ def machine(rows: list[Row]) -> str:
     def words(name: str) -> str:
         return ", ".join(sorted({str(row["versions"][name]) for row in rows}))
 
-    peers = sorted({f"{n} {v}" for r in rows for n, v in r.get("peer", {}).get("packages", {}).items() if n in PEERS})
+    used = [row["peer"].get("packages", {}) for row in rows if "peer" in row and row["work"] not in OWN]
+    peers = ", ".join(sorted({f"{n} {v}" for packages in used for n, v in packages.items() if n in PEERS}))
     dates = sorted({row["date"] for row in rows})
     return (
         f"{words('cores')} x86 cores ({words('device')}), shared with other work: the load is the mean number "
         f"of processes that wanted a core. Python {words('python')}, jax {words('jax')}, "
-        f"MuJoCo {words('mujoco')}, Gymnasium {words('gymnasium')}; peers: {', '.join(peers)}. "
+        f"MuJoCo {words('mujoco')}, Gymnasium {words('gymnasium')}{peers and f'; peers: {peers}'}. "
         f"Commit {commits(rows)}; {' to '.join(dates)}. "
         "Rows: `benchmarks/results/speed.jsonl`."
     )
@@ -304,12 +304,14 @@ PEERS = ("torch", "jax", "stable_baselines3", "sbx_rl")
 
 def pages(root: Path) -> dict[str, str]:
     """Return the generated sections of docs/performance.md by key, and draw its picture."""
-    rows = read_rows()
-    if not rows:
+    every = read_rows()
+    if not every:
         return {}
+    rows, own = ([row for row in every if (row["work"] in OWN) == ours] for ours in (False, True))
     draw_sizes(rows, root / "docs" / "img" / "performance-sizes.png")
     return {
         "speed-compared": "\n\n".join(x for x in (compared(rows), behind(rows), provenance(rows)) if x),
+        "speed-own": "\n\n".join((compared(own, ("first", "second")), provenance(own))),
         "speed-resources": resources(rows),
         "speed-parts": parts(rows),
         "speed-floors": floors(rows),

@@ -93,6 +93,9 @@ WORKS = {
     )
 }
 
+OWN = {name for name, work in WORKS.items() if work.sides["peer"]["kind"] == "ours"}
+"""Benchmarks of ours beside ours."""
+
 
 def _size(preset: str, env: str, delay: int, seeds: int, steps: int) -> Work:
     name = f"size-{preset}-{env}-{delay}-{seeds}"

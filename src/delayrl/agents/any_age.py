@@ -130,15 +130,15 @@ class AnyAge:
         key: Key,
     ) -> State:
         """Take one gradient step on the actor: half for each age, the pull of the older one, and the belief's loss."""
-        temperature, keys = jnp.exp(state.log_temperature), jax.random.split(key)
+        temperature, both_ages = jnp.exp(state.log_temperature), jnp.stack([actor_input, younger])
+        same_states = jnp.stack([critic_input, critic_input])
 
         def loss(actor: Params) -> tuple[Array, None]:
-            older, other = self.learner.policy(actor, actor_input), self.learner.policy(actor, younger)
-            total = weight * self.distance(older, other)
-            for policy, sample_key in zip((older, other), keys, strict=True):
-                action, log_prob = networks.sample(policy, sample_key)
-                q = networks.twin(state.critic, critic_input, action)
-                total -= 0.5 * soft_value(q, log_prob, temperature).mean()
+            policy = self.learner.policy(actor, both_ages)
+            action, log_prob = networks.sample(policy, key)
+            q = networks.twin(state.critic, same_states, action)
+            total = -soft_value(q, log_prob, temperature).mean()
+            total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.belief_weight:
                 total += self.belief_weight * belief_loss(actor, actor_input, windows)
             return total, None
