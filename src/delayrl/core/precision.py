@@ -1,4 +1,4 @@
-"""Matrix products in the precision of a run. XLA has bfloat16 on accelerators alone: on a CPU it is written out."""
+"""Matrix products in the precision of a run. XLA follows that setting on accelerators; on a CPU we round factors."""
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,13 @@ FEW = 32
 
 
 def product(x: Float[Array, "*rows inputs"], w: Float[Array, "*copies inputs outputs"]) -> Float[Array, "*rows _"]:
-    """Return X W in the precision that `jax.default_matmul_precision` asks for. W's leading axes are X's too."""
-    if jax.config.jax_default_matmul_precision != BFLOAT16 or w.shape[-1] < FEW:
+    """Return X W in the precision that `jax.default_matmul_precision` asks for. W's leading axes are X's too.
+
+    One row, as in acting, is not worth rounding W: on a CPU it stays in float32.
+    """
+    if jax.config.jax_default_matmul_precision != BFLOAT16 or w.shape[-1] < FEW or x.ndim == 1:
         return x @ w
-    return _rounded_product(jnp.atleast_2d(x), w).reshape(*x.shape[:-1], -1)
+    return _rounded_product(x, w)
 
 
 @jax.custom_vjp
