@@ -54,7 +54,7 @@ def name(config: dict[str, Any]) -> str:
 
 
 def table(runs: Runs) -> str:
-    """Return a Markdown table: area and final return by task and library, and how much larger an area is."""
+    """Return a Markdown table: area and final return by task and library, and its difference from the base."""
     head = ["task", "SAC of", "seeds", "mean return over training", "after training"]
     head.append("difference over training, 95 % interval")
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]

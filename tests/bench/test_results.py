@@ -224,7 +224,7 @@ def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
     main(["bench", "plan", *words])
     out = capsys.readouterr().out
     assert all(cell.id in out for cell in grid.cells)
-    assert "preset small, 60 steps, batch_size=4, " in out
+    assert "\nall cells: evaluate_every=30, evaluation_episodes=2, random_steps=20, replay_capacity=50\n" in out
     assert "mixed: 2 cells, 4 runs, 240 steps" in out
     main(["bench", "status", *words])
     out = capsys.readouterr().out

@@ -12,12 +12,13 @@ from delayrl.agents.base import Phase, Schedule
 from delayrl.agents.dida import DIDA
 from delayrl.agents.random import Random
 from delayrl.agents.sac import BPQL, SAC
+from delayrl.core.precision import BFLOAT16, FEW, product
 from delayrl.core.types import Spec
 from delayrl.core.views import input_size
 from delayrl.play.run import Run
 from delayrl.run.cost import Cost
 from delayrl.training.cost import cost_of, update_counts
-from delayrl.training.products import follow, matmul_flops
+from delayrl.training.products import follow, matmul_flops, traced_updates
 from short_runs import arrays
 
 SPEC, SCHEDULE = Spec(10, 3, 4), Schedule(steps=2_099, random_steps=100)
@@ -52,6 +53,18 @@ def test_an_expert_that_stops_and_a_student_that_begins() -> None:
     assert cost.gradient_steps["reference.critic"] == pytest.approx(1001 / 2000, abs=5e-4)
     assert cost.gradient_steps["networks"] == pytest.approx(2 * 100 / 200, abs=0.02)
     assert cost.batches == (agent.reference.batch_size, agent.student_batch_size)
+
+
+def test_the_cost_does_not_depend_on_the_precision() -> None:
+    """Whatever was asked first: in bfloat16 the products are written out, with gradients that nobody takes."""
+
+    def flops(precision: str) -> tuple[float, float]:
+        traced_updates.cache_clear()
+        with jax.default_matmul_precision(precision):
+            return cost_of(BPQL, SPEC, SCHEDULE).flops, matmul_flops(lambda x: product(x, x), jnp.ones((FEW, FEW)))
+
+    assert flops(BFLOAT16) == flops("float32")
+    traced_updates.cache_clear()
 
 
 def test_flops_are_those_of_the_branches_that_are_taken() -> None:

@@ -15,6 +15,7 @@ from killing import KilledError, moments, options
 import delayrl
 from conftest import quick
 from delayrl.agents.registry import AGENTS
+from delayrl.core.precision import FEW
 from delayrl.play.run import Run
 from delayrl.run.folder import RunFolder
 from delayrl.training.actor import Actor
@@ -115,12 +116,16 @@ def test_sigkill_at_random_moments(agent: str, trial: int, tmp_path: Path, whole
 
 
 @pytest.mark.parametrize(
-    ("agent", "at", "protocol"),
-    [("bpql", 260, "official"), *((agent, 237, "corrected") for agent in AGENTS)],
+    ("agent", "at", "options"),
+    [
+        ("bpql", 260, {"protocol": "official"}),
+        ("bpql", 237, {"precision": "bfloat16", "hidden": [FEW, FEW]}),
+        *((agent, 237, {}) for agent in AGENTS),
+    ],
 )
-def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str, tmp_path: Path, monkeypatch) -> None:
+def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict, tmp_path: Path, monkeypatch) -> None:
     """Bit for bit: rows and parameters, with a replay that has gone round, and an episode cut in its middle."""
-    whole = train(agent, tmp_path / "whole", protocol=protocol)
+    whole = train(agent, tmp_path / "whole", **options)
     step = Actor.step
     calls = 0
 
@@ -133,7 +138,7 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
 
     monkeypatch.setattr(Actor, "step", dying)
     with pytest.raises(KilledError):
-        train(agent, tmp_path / "cut", protocol=protocol, slim=True)
+        train(agent, tmp_path / "cut", **options, slim=True)
     monkeypatch.setattr(Actor, "step", step)
     run = RunFolder(tmp_path / "cut")
     assert run.latest().step == at // 100 * 100
@@ -141,7 +146,7 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, protocol: str,
     run.append("rows", [{"step": 299, "policy": "agent", "episode": 0, "reset_seed": 0, "return": 0.0, "length": 1}])
     with open(run.path / "rows.jsonl", "a") as file:
         file.write('{"step": 299, "pol')
-    resumed = train(agent, tmp_path / "cut", protocol=protocol, slim=True)
+    resumed = train(agent, tmp_path / "cut", **options, slim=True)
     assert resumed.rows() == whole.rows()
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])

@@ -10,6 +10,7 @@ import pytest
 
 import delayrl
 from conftest import quick
+from delayrl.core.precision import FEW
 from delayrl.envs import make
 from delayrl.play.evaluation import Evaluator
 from delayrl.play.run import Run
@@ -108,7 +109,7 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
     monkeypatch.setattr(Program, "learn", learning)
     monkeypatch.setattr(Program, "act", acting)
     monkeypatch.setattr(Evaluator, "__call__", evaluating)
-    run = train("bpql", tmp_path / "run", steps=101, precision=precision)
+    run = train("bpql", tmp_path / "run", steps=101, precision=precision, hidden=[FEW, FEW])
     assert len(run.rows()) == 4
     assert len(lowered) > 30
     assert all(words in line for line in lowered)

@@ -59,7 +59,7 @@ _MATCHED = Schedule(steps=100_000, random_steps=5_000, replay_capacity=200_000, 
 
 
 def _presets(paper: Agent, matched: Agent, small: Agent, schedule: Schedule = _PAPER) -> dict[str, Preset]:
-    """Return the paper's hyperparameters, those that compare methods, and small ones that train in minutes."""
+    """Return the paper's hyperparameters, those for comparing methods, and small ones that train in minutes."""
     return {
         "paper": Preset(paper, schedule),
         "matched": Preset(matched, _MATCHED),
@@ -74,7 +74,7 @@ def _soft(summary: str, paper: str, **sees: str) -> Registration:
 
 
 _MATCHED_SAC = SAC(entropy_unit="scaled")
-"""VDPO's SAC: the preset `matched` builds every agent on it. It learns faster than the field's (docs/benchmarks.md)."""
+"""VDPO's SAC, with entropies over [-1, 1]: the preset `matched` builds every agent on it (docs/decisions.md)."""
 _MATCHED_BPQL = replace(_MATCHED_SAC, actor_sees="augmented")
 _MATCHED_ADSAC = replace(_MATCHED_BPQL, critic_sees="augmented", actor_updates=4)  # two for each of its two actors
 _MATCHED_VDPO = VDPO(_MATCHED_SAC, width=64, layers=2, dropout=0.0, clone_every=1, clone_updates=1)

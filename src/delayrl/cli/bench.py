@@ -67,11 +67,14 @@ def run(given: argparse.Namespace) -> None:
 
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:
-    for cell in grid.cells:
-        preset, steps, overrides = cell.condition.preset, cell.condition.steps, cell.condition.overrides
-        changed = [f"{name}={value}" for name, value in sorted(overrides.items()) if name != "steps"]
-        setup = ", ".join([f"preset {preset}", f"{steps:,} steps", *changed])
-        print(f"{cell.id}  {status(cell, given.runs):<7}  {cell}, {setup}")
+    changed = [{f"{k}={v}" for k, v in cell.condition.overrides.items() if k != "steps"} for cell in grid.cells]
+    everywhere = set.intersection(*changed) if len(changed) > 1 else set()
+    for cell, own in zip(grid.cells, changed, strict=True):
+        condition = cell.condition
+        setup = [f"preset {condition.preset}", f"{condition.steps:,} steps", *sorted(own - everywhere)]
+        print(f"{cell.id}  {status(cell, given.runs):<7}  {cell}, {', '.join(setup)}")
+    if everywhere:
+        print(f"\nall cells: {', '.join(sorted(everywhere))}")
     runs = sum(len(cell.seeds) for cell in grid.cells)
     steps = sum(cell.condition.steps * len(cell.seeds) for cell in grid.cells)
     print(f"\n{grid.name}: {len(grid.cells)} cells, {runs} runs, {steps:,} steps")

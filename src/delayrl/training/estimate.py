@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from delayrl.agents.base import Agent, Phase, template
 from delayrl.core import replay as ring
+from delayrl.core.precision import product
 from delayrl.core.types import Spec
 from delayrl.training.state import Group, TrainState
 
@@ -27,7 +28,7 @@ def estimate(group: Group, state: TrainState) -> str:
 def _seconds(group: Group, state: TrainState) -> float:
     """Guess from the updates' arithmetic, at a fraction of this device's matmul rate."""
     square = jnp.ones((1024, 1024))
-    multiply = jax.jit(lambda x: x @ x)
+    multiply = jax.jit(lambda x: product(x, x))
     multiply(square).block_until_ready()
     start = time.perf_counter()
     for _ in range(4):

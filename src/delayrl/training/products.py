@@ -60,12 +60,14 @@ SCALAR: dict[str, Callable[..., Any]] = {
 def traced_updates(agent: Agent, spec: Spec) -> list[tuple[Phase, Any]]:
     """Return each phase with the program of its update for one seed. Touches no device."""
     shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
-    return [(phase, jax.jit(phase.update).trace(*args).jaxpr.jaxpr) for phase, args in shapes]
+    with jax.default_matmul_precision("float32"):  # in bfloat16 gradients that XLA deletes are written out
+        return [(phase, jax.jit(phase.update).trace(*args).jaxpr.jaxpr) for phase, args in shapes]
 
 
 def matmul_flops(function: Callable[..., Any], *args: Any) -> float:
     """Count the multiplications and additions of all matrix products of a function on arguments of these shapes."""
-    products, _ = follow(jax.make_jaxpr(function)(*args).jaxpr)
+    with jax.default_matmul_precision("float32"):
+        products, _ = follow(jax.make_jaxpr(function)(*args).jaxpr)
     return sum(product.flops for product in products)
 
 
