@@ -88,16 +88,17 @@ def difference(one: statistics.Floats, other: statistics.Floats | None) -> str:
 
 def draw(runs: Runs, out: Path) -> None:
     """Draw return against steps: the mean over seeds, and a thin line for each seed, a panel for each task."""
-    figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 3.8), layout="constrained", squeeze=False)
+    figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 4.2), layout="constrained", squeeze=False)
+    lines = {}
     for axes, (task, by_name) in zip(panels[0], sorted(runs.items()), strict=True):
         for who in sorted(by_name, key=list(COLOURS).index):
             steps, returns = statistics.common_steps(list(by_name[who].values()))
             axes.plot(steps, returns.T, color=COLOURS[who], alpha=0.2, linewidth=0.8)
-            axes.plot(steps, returns.mean(0), color=COLOURS[who], linewidth=2.2, label=f"{who}, {len(returns)} seeds")
+            (lines[who],) = axes.plot(steps, returns.mean(0), color=COLOURS[who], linewidth=2.2)
         axes.set(xlabel="environment steps", ylabel="return", title=f"{task}, no delay")
         axes.grid(alpha=0.25)
-        axes.legend(frameon=False)
         axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(lines.values(), lines, loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)
 
