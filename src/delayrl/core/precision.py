@@ -14,7 +14,7 @@ FEW = 32
 def product(x: Float[Array, "*rows inputs"], w: Float[Array, "*copies inputs outputs"]) -> Float[Array, "*rows _"]:
     """Return X W in the precision that `jax.default_matmul_precision` asks for. W's leading axes are X's too.
 
-    One row, as in acting, is not worth rounding W: on a CPU it stays in float32.
+    One row is not worth rounding W; and under `jax.vmap` its gradient would be a matrix for each. It stays in float32.
     """
     if jax.config.jax_default_matmul_precision != BFLOAT16 or w.shape[-1] < FEW or x.ndim == 1:
         return x @ w
