@@ -18,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from gate import pin
 
-from delayrl.agents.base import PRODUCTS, Agent, Phase
+from delayrl.agents.base import Agent, Phase
 from delayrl.agents.registry import AGENTS
 from delayrl.core import replay as ring
+from delayrl.core.precision import setting
 from delayrl.core.types import Spec, Transition
 from delayrl.delays import Delay
 from delayrl.envs import delay_of, make
@@ -212,7 +213,7 @@ def main() -> None:
     precision = side["options"].get("precision", "float32")
     if on_cpu := side["device"] == "cpu":  # set by name: `keep_buffers` must come before JAX looks for devices
         jax.config.update("jax_platforms", "cpu")
-    with on_device(None if on_cpu else side["device"]), jax.default_matmul_precision(PRODUCTS[precision]):
+    with on_device(None if on_cpu else side["device"]), jax.default_matmul_precision(setting(precision)):
         print(json.dumps(parts(side)))
 
 

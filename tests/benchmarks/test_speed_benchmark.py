@@ -95,7 +95,7 @@ def test_floor_multiplies_as_training_does(monkeypatch, capsys) -> None:
     """In the run's precision, not in the device's: a GPU's own is coarser, and faster."""
     monkeypatch.setattr(floor, "pin", lambda: None)
     monkeypatch.setattr(floor, "parts", lambda side: jax.config.jax_default_matmul_precision)
-    for options, words in (({}, '"float32"'), ({"precision": "bfloat16"}, '"BF16_BF16_F32"')):
+    for options, words in (({}, '"float32"'), ({"precision": "bfloat16"}, '"bfloat16"')):
         monkeypatch.setattr(sys, "argv", ["floor.py", json.dumps({"device": "cpu", "options": options})])
         floor.main()
         assert capsys.readouterr().out.strip() == words

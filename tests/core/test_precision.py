@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from delayrl.core.networks import mlp, mlp_init
-from delayrl.core.precision import BFLOAT16, FEW, product
+from delayrl.core.precision import BFLOAT16, FEW, product, setting
 
 SHAPES = [((24, 40), (40, 48)), ((2, 24, 40), (2, 40, 48))]
 
@@ -30,7 +30,7 @@ def test_factors_are_rounded_and_sums_are_not(rows, weights, lockstep: bool) -> 
         y, back = jax.vjp(product, x, w)
         return y, *back(slope)
 
-    with jax.default_matmul_precision(BFLOAT16):
+    with jax.default_matmul_precision(setting("bfloat16")):
         if lockstep:
             pairs = jax.jit(jax.vmap(both))(*(np.stack([a, 2 * a]) for a in (x, w, slope)))
             found = [pair[0] for pair in pairs]
@@ -45,10 +45,27 @@ def test_factors_are_rounded_and_sums_are_not(rows, weights, lockstep: bool) -> 
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-4)
 
 
+def test_setting_of_a_device() -> None:
+    """By the device of the context; a CPU is one wherever there is an accelerator beside it."""
+    assert [setting(name) for name in ("float32", "tensorfloat32", "bfloat16")] == [
+        "float32",
+        "tensorfloat32",
+        "bfloat16",
+    ]
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert setting("bfloat16") == "bfloat16"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        assert setting("bfloat16") == "BF16_BF16_F32"
+        with jax.default_device(jax.devices("cpu")[0]):
+            assert setting("bfloat16") == "bfloat16"
+
+
 def test_other_precisions_few_outputs_and_one_row_are_float32() -> None:
     """The same numbers as without a setting."""
     x, w, few = drawn((24, 40), (40, FEW), (40, FEW - 1))
-    cases = [(BFLOAT16, x, w, False), (BFLOAT16, x, few, True), (BFLOAT16, x[0], w, True), ("float32", x, w, True)]
+    cases = [(BFLOAT16[0], x, w, False), (BFLOAT16[1], x, w, False), (BFLOAT16[1], x, few, True)]
+    cases += [(BFLOAT16[1], x[0], w, True), ("float32", x, w, True)]
     for precision, rows, weights, same in cases:
         with jax.default_matmul_precision(precision):
             assert np.array_equal(jax.jit(product)(rows, weights), jax.jit(jnp.matmul)(rows, weights)) == same
@@ -59,7 +76,7 @@ def test_gradient_of_a_network() -> None:
     params = mlp_init(jax.random.key(0), (40, 64, 64, 3), norm="layer")
     x = jnp.asarray(drawn((32, 40))[0])
     slopes = []
-    for precision in ("float32", BFLOAT16):
+    for precision in ("float32", BFLOAT16[1]):
         with jax.default_matmul_precision(precision):
             grad = jax.jit(jax.grad(lambda params: (mlp(params, x) ** 2).mean()))(params)
         slopes.append(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(grad)]))

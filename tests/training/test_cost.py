@@ -63,7 +63,7 @@ def test_the_cost_does_not_depend_on_the_precision() -> None:
         with jax.default_matmul_precision(precision):
             return cost_of(BPQL, SPEC, SCHEDULE).flops, matmul_flops(lambda x: product(x, x), jnp.ones((FEW, FEW)))
 
-    assert flops(BFLOAT16) == flops("float32")
+    assert flops(BFLOAT16[1]) == flops("float32")
     traced_updates.cache_clear()
 
 

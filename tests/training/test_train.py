@@ -5,6 +5,7 @@ import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -109,6 +110,7 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
     monkeypatch.setattr(Program, "learn", learning)
     monkeypatch.setattr(Program, "act", acting)
     monkeypatch.setattr(Evaluator, "__call__", evaluating)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     run = train("bpql", tmp_path / "run", steps=101, precision=precision, hidden=[FEW, FEW])
     assert len(run.rows()) == 4
     assert len(lowered) > 30

@@ -1,7 +1,7 @@
 """The interface between agents and the training loop. Agents implement the protocol `Agent`; they inherit nothing."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -10,14 +10,11 @@ import optax
 from jaxtyping import Array, Int
 
 from delayrl.core.networks import Params
-from delayrl.core.precision import BFLOAT16
+from delayrl.core.precision import Precision
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import Sees
 
-Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 ObservationNorm = Literal["none", "running"]
-PRODUCTS: Mapping[Precision, str] = {"float32": "float32", "tensorfloat32": "tensorfloat32", "bfloat16": BFLOAT16}
-"""Each precision as `jax.default_matmul_precision` names it."""
 State = Any
 """An agent's state: a pytree of arrays (networks, optimiser states, temperatures)."""
 

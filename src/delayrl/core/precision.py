@@ -1,14 +1,28 @@
 """Matrix products in the precision of a run. XLA follows that setting on accelerators; on a CPU we round factors."""
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Float
 
-BFLOAT16 = "BF16_BF16_F32"
-"""`jax.default_matmul_precision` of bfloat16 factors and float32 sums. JAX's "bfloat16" is tensorfloat32 on a GPU."""
+Precision = Literal["float32", "tensorfloat32", "bfloat16"]
+BFLOAT16 = ("BF16_BF16_F32", "bfloat16")
+"""`jax.default_matmul_precision` of bfloat16 factors and float32 sums: on accelerators, and on a CPU.
+
+JAX's "bfloat16" is tensorfloat32 on a GPU. With the other name XLA's CPU compiler aborts at some products.
+"""
 FEW = 32
 """Fewer outputs (Q-values, means, log-stds) cost little, and stay in float32 on a CPU."""
+
+
+def setting(precision: Precision) -> str:
+    """Return what `jax.default_matmul_precision` takes for the device of this context (`jax.default_device`)."""
+    if precision != "bfloat16":
+        return precision
+    device = jax.config.jax_default_device
+    return BFLOAT16[getattr(device, "platform", device or jax.default_backend()) == "cpu"]
 
 
 def product(x: Float[Array, "*rows inputs"], w: Float[Array, "*copies inputs outputs"]) -> Float[Array, "*rows _"]:
@@ -16,7 +30,7 @@ def product(x: Float[Array, "*rows inputs"], w: Float[Array, "*copies inputs out
 
     One row is not worth rounding W; and under `jax.vmap` its gradient would be a matrix for each. It stays in float32.
     """
-    if jax.config.jax_default_matmul_precision != BFLOAT16 or w.shape[-1] < FEW or x.ndim == 1:
+    if jax.config.jax_default_matmul_precision not in BFLOAT16 or w.shape[-1] < FEW or x.ndim == 1:
         return x @ w
     return _rounded_product(x, w)
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from tqdm import tqdm
 
-from delayrl.agents.base import PRODUCTS
 from delayrl.core.cache import keep_compiled
+from delayrl.core.precision import setting
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
@@ -145,13 +145,12 @@ def train_group(
     keep_compiled()
     if device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
-    precision = PRODUCTS[setup.schedule.precision]
     with ExitStack() as held:
         for folder in folders:
             held.enter_context(hold(folder.path))
         pool = held.enter_context(ThreadPoolExecutor(threads))
         held.enter_context(on_device(device))
-        held.enter_context(jax.default_matmul_precision(precision))
+        held.enter_context(jax.default_matmul_precision(setting(setup.schedule.precision)))
         privileged, rules = setup.agent.privileged, setup.protocol
         actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
