@@ -14,6 +14,7 @@ from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.core import networks
 from delayrl.core import replay as ring
+from delayrl.core.forecast import as_mlp, follow_changes, forecast_loss, forecasting
 from delayrl.core.objectives import soft_value
 from delayrl.core.sequence import sequence
 from delayrl.core.types import Spec
@@ -137,8 +138,63 @@ def test_a_sequence_is_read_at_its_age(rng: np.random.Generator) -> None:
 
 def test_a_sequence_without_a_delay_is_sac() -> None:
     plain = replace(SEQUENTIAL, second_age="none", belief_weight=0.0)
-    for agent in (SEQUENTIAL, plain):
+    for agent in (SEQUENTIAL, plain, FORECASTING):
         assert same(trained(agent, 0)[0].agent, trained(replace(AGENT.bpql, actor_sees="current"), 0)[0].agent)
+
+
+FORECASTING = replace(AGENT, encoder="forecast")
+
+
+def away_from_start(spec: Spec) -> networks.Params:
+    """An actor with a forecast, whose biases and deviations are not their initial ones."""
+    actor = FORECASTING.init(spec, jax.random.key(0)).actor
+    leaves, form = jax.tree.flatten(actor)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    return jax.tree.unflatten(form, [x + jax.random.uniform(k, x.shape) for x, k in zip(leaves, keys, strict=True)])
+
+
+def test_a_forecast_by_hand(rng: np.random.Generator) -> None:
+    """The policy reads the observation plus its forecast change, beside x_t; exported, both are one MLP."""
+    actor = away_from_start(Spec(OBS, ACT, 3))
+    x = jnp.asarray(rng.normal(size=(6, OBS + 3 * ACT + 1)), jnp.float32)
+    now = x[:, :OBS] + actor["deviation"] * networks.mlp(actor["forecast"], x)
+    expected = networks.mlp(actor["policy"], jnp.concatenate([now, x], 1))
+    np.testing.assert_allclose(forecasting(actor, x), expected, rtol=1e-5)
+    np.testing.assert_allclose(networks.mlp(as_mlp(actor), x), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator) -> None:
+    """Its error is in deviations, which follow the changes; the values of actions do not move it."""
+    actor = away_from_start(Spec(OBS, ACT, 3))
+    x = jnp.asarray(rng.normal(size=(2, 5, OBS + 3 * ACT + 1)), jnp.float32)
+    state = jnp.asarray(rng.normal(size=(2, 5, OBS)), jnp.float32)
+    change = np.asarray(state - x[..., :OBS])
+    error = np.asarray(networks.mlp(actor["forecast"], x)) - change / np.asarray(actor["deviation"])
+    np.testing.assert_allclose(forecast_loss(actor, x, state), (error**2).mean(), rtol=1e-5)
+    learned = jax.grad(forecast_loss)(actor, x, state)
+    valued = jax.grad(lambda actor: (forecasting(actor, x) ** 2).mean())(actor)
+    for gradient, moved in ((learned, {"forecast"}), (valued, {"policy"})):
+        parts = {name: jax.tree.leaves(part) for name, part in gradient.items()}
+        assert {name for name, leaves in parts.items() if any(jnp.abs(leaf).max() > 0 for leaf in leaves)} == moved
+    square = 0.99 * np.asarray(actor["deviation"]) ** 2 + 0.01 * (change**2).mean((0, 1))
+    np.testing.assert_allclose(follow_changes(actor, x, state)["deviation"], np.sqrt(square), rtol=1e-4)
+
+
+def test_a_forecast_is_learned_in_an_update() -> None:
+    """At both ages, towards the true state; a second age of none shows the same view twice."""
+    state = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
+    windows = random_windows(Spec(OBS, ACT, 3))
+    older, now = FORECASTING.bpql._inputs(windows, 0)
+    younger = FORECASTING.younger(windows, jax.random.key(2))
+    moved = FORECASTING.improve_actor(windows, younger, jnp.float32(0.0), state, older, now, jax.random.key(5))
+    expected = jax.grad(lambda p: 0.5 * forecast_loss(p, older, now) + 0.5 * forecast_loss(p, younger, now))(
+        state.actor
+    )
+    mean = moved.actor_opt_state[0].mu
+    for a, b in zip(jax.tree.leaves(mean["forecast"]), jax.tree.leaves(expected["forecast"]), strict=True):
+        np.testing.assert_allclose(a / 0.1, b, rtol=1e-3, atol=1e-6)
+    assert not np.allclose(moved.actor["deviation"], state.actor["deviation"])
+    np.testing.assert_array_equal(replace(FORECASTING, second_age="none").younger(windows, jax.random.key(2)), older)
 
 
 def test_belief_by_hand() -> None:

@@ -21,6 +21,7 @@ from delayrl.run.folder import RunFolder
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
+AGENTS["any-age, forecast"] = replace(TINY["any-age"], encoder="forecast")
 AGENTS["any-age, transformer"] = replace(TINY["any-age"], encoder="transformer", encoder_width=8)
 AGENTS |= {f"{name}, normalised": NormalisedObservations(TINY[name]) for name in ("bpql", "vdpo")}
 DELAY = 4

@@ -25,16 +25,17 @@ from delayrl.agents.base import Agent, Deterministic, Phase, Schedule, descend
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
+from delayrl.core.forecast import as_mlp, follow_changes, forecast_init, forecast_loss, forecasting
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import annealed, gaussian_kl, masked_mean, soft_value
-from delayrl.core.sequence import flat_or_sequence, sequence_init, tokens
+from delayrl.core.sequence import sequence, sequence_init, tokens
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
 
 SecondAge = Literal["none", "random", "zero"]
 Pull = Literal["moments", "kl"]
-Encoder = Literal["mlp", "transformer"]
+Encoder = Literal["mlp", "forecast", "transformer"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class AnyAge:
     pull_weight: Annotated[float, "initial weight of the pull towards the younger age", (0.0, 1e6)] = 1.0
     pull_hold: Annotated[float, "part of the run in which the weight stays constant", (0.0, 1.0)] = 0.25
     pull_end: Annotated[float, "part of the run after which the weight, falling linearly, is 0", (0.0, 1.0)] = 0.75
-    encoder: Annotated[Encoder, "how the actor reads x_t: as one vector, or by VDPO's transformer"] = "mlp"
+    encoder: Annotated[Encoder, "how the actor reads x_t: flat, flat with a forecast of s_t, or as a sequence"] = "mlp"
     encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
     encoder_layers: Annotated[int, "transformer blocks"] = 2
     belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
@@ -71,18 +72,21 @@ class AnyAge:
         """Return the agent with the length of its run. Raises DelayRLError for options that contradict each other."""
         if self.pull_hold > self.pull_end:
             raise DelayRLError(f"pull_hold must be no later than pull_end, {self.pull_end}; got {self.pull_hold}")
-        if self.belief_weight and (self.encoder == "mlp" or self.second_age == "none"):
+        if self.belief_weight and (self.encoder != "transformer" or self.second_age == "none"):
             raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
         return replace(self, run_steps=schedule.steps)
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Initialise as BPQL, but for an actor that reads a sequence; without a delay there is none to read."""
+        """Initialise as BPQL, but for the actor of another encoder; without a delay there is nothing to encode."""
         state = self.bpql.init(spec, key)
         if self.encoder == "mlp" or spec.delay == 0:
             return state
         actor_key, belief_key = jax.random.split(jax.random.fold_in(key, 1))
-        sizes = self.encoder_width, self.encoder_layers, self.bpql.hidden, 2 * spec.action_size
-        actor = sequence_init(actor_key, spec, *sizes)
+        if self.encoder == "forecast":
+            actor = forecast_init(actor_key, spec, self.bpql.hidden, 2 * spec.action_size)
+        else:
+            sizes = self.encoder_width, self.encoder_layers, self.bpql.hidden, 2 * spec.action_size
+            actor = sequence_init(actor_key, spec, *sizes)
         if self.belief_weight:
             actor["belief"] = networks.linear_init(belief_key, self.encoder_width, spec.obs_size)
         return state._replace(actor=actor, actor_opt_state=optax.adam(self.bpql.actor_learning_rate).init(actor))
@@ -93,18 +97,20 @@ class AnyAge:
 
     def deterministic(self, state: State) -> Deterministic:
         """Return the actor."""
+        if "forecast" in state.actor:
+            return Deterministic("augmented", as_mlp(state.actor))
         if isinstance(state.actor, dict):
             return Deterministic("augmented", state.actor["head"], state.actor["encoder"], state.actor["current"])
         return self.bpql.deterministic(state)
 
     @property
     def learner(self) -> sac.SAC:
-        """BPQL with an actor of either kind."""
-        return replace(self.bpql, actor_network=flat_or_sequence)
+        """BPQL with an actor of any encoder."""
+        return replace(self.bpql, actor_network=encoded)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """Update the critics as BPQL does, and the actor at two ages."""
-        if self.second_age == "none" or windows.delay == 0:
+        if (self.second_age == "none" and self.encoder != "forecast") or windows.delay == 0:
             return self.learner.update(state, windows, key, count)
         age_key, update_key = jax.random.split(key)
         weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
@@ -113,10 +119,10 @@ class AnyAge:
         return state, metrics | {"pull_weight": weight}
 
     def younger(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
-        """Return x^(j)_t of each window, j uniform on 0..d or 0, as the actor sees it."""
+        """Return x^(j)_t of each window, j uniform on 0..d, or 0, or d itself, as the actor sees it."""
         age = windows.age[:, windows.delay]
         share = jax.random.uniform(key, age.shape) if self.second_age == "random" else jnp.zeros(age.shape)
-        ages = jnp.floor(share * (age + 1)).astype(jnp.int32)
+        ages = age if self.second_age == "none" else jnp.floor(share * (age + 1)).astype(jnp.int32)
         return jax.vmap(lambda window, age: network_input(view(window, age=age), "augmented"))(windows, ages)
 
     def improve_actor(
@@ -129,7 +135,7 @@ class AnyAge:
         critic_input: Array,
         key: Key,
     ) -> State:
-        """Take one gradient step on the actor: half for each age, the pull of the older one, and the belief's loss."""
+        """Take one gradient step on the actor: half for each age, the pull of the older one, its encoder's loss."""
         temperature, both_ages = jnp.exp(state.log_temperature), jnp.stack([actor_input, younger])
         same_states = jnp.stack([critic_input, critic_input])
 
@@ -139,12 +145,16 @@ class AnyAge:
             q = networks.twin(state.critic, same_states, action)
             total = -soft_value(q, log_prob, temperature).mean()
             total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
+            if self.encoder == "forecast":
+                total += forecast_loss(actor, both_ages, same_states)
             if self.belief_weight:
                 total += self.belief_weight * belief_loss(actor, actor_input, windows)
             return total, None
 
         adam = optax.adam(self.bpql.actor_learning_rate)
         actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)
+        if self.encoder == "forecast":
+            actor = follow_changes(actor, both_ages, same_states)
         return state._replace(actor=actor, actor_opt_state=opt_state)
 
     def distance(self, older: Gaussian, younger: Gaussian) -> Float[Array, ""]:
@@ -156,6 +166,13 @@ class AnyAge:
     def weight(self, step: Int[Array, ""]) -> Float[Array, ""]:
         """Return w(t), which is constant at first, then falls linearly to 0 and stays there."""
         return self.pull_weight * annealed(step, self.pull_hold * self.run_steps, self.pull_end * self.run_steps)
+
+
+def encoded(actor: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
+    """Apply an actor of any encoder; without a delay it is an `mlp`, which is a list."""
+    if isinstance(actor, list):
+        return networks.mlp(actor, x)
+    return forecasting(actor, x) if "forecast" in actor else sequence(actor, x)
 
 
 def belief_loss(actor: Params, x: Float[Array, "batch input"], windows: Window) -> Float[Array, ""]:

@@ -19,11 +19,6 @@ def sequence_init(key: Key, spec: Spec, width: int, layers: int, hidden: tuple[i
     }
 
 
-def flat_or_sequence(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
-    """Apply parameters of `sequence_init`, or else of `mlp_init`."""
-    return sequence(params, x) if isinstance(params, dict) else mlp(params, x)
-
-
 def sequence(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
     """Apply the head to what the encoder says at the age of x_t, or at age 0 `current` to the observation."""
     obs, _, age = _parts(params, x)
