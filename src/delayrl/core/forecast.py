@@ -32,15 +32,20 @@ def forecasting(params: Params, x: Float[Array, "*batch input"]) -> Float[Array,
 
 def forecast_loss(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Array:
     """Return the mean squared error of the change from the observation in x_t to s_t, in deviations."""
-    change = (state - x[..., : state.shape[-1]]) / jax.lax.stop_gradient(params["deviation"])
+    change = _change(x, state) / jax.lax.stop_gradient(params["deviation"])
     return ((mlp(params["forecast"], x) - change) ** 2).mean()
 
 
 def follow_changes(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Params:
     """Return the parameters with deviations that have moved towards the root mean square of a batch's changes."""
-    change = (state - x[..., : state.shape[-1]]).reshape(-1, state.shape[-1])
+    change = _change(x, state).reshape(-1, state.shape[-1])
     square = (1 - RATE) * params["deviation"] ** 2 + RATE * (change**2).mean(0)
     return params | {"deviation": jnp.sqrt(square + 1e-8)}
+
+
+def _change(x: Array, state: Array) -> Array:
+    """Return s_t less the observation in x_t, which comes first in it."""
+    return state - x[..., : state.shape[-1]]
 
 
 def as_mlp(params: Params) -> Params:
