@@ -21,7 +21,7 @@ def setting(precision: Precision) -> str:
     """Return what `jax.default_matmul_precision` takes for the device of this context (`jax.default_device`)."""
     if precision != "bfloat16":
         return precision
-    device = jax.config.jax_default_device
+    device = jax.default_device.value
     return BFLOAT16[getattr(device, "platform", device or jax.default_backend()) == "cpu"]
 
 
@@ -30,7 +30,7 @@ def product(x: Float[Array, "*rows inputs"], w: Float[Array, "*copies inputs out
 
     One row is not worth rounding W; and under `jax.vmap` its gradient would be a matrix for each. It stays in float32.
     """
-    if jax.config.jax_default_matmul_precision not in BFLOAT16 or w.shape[-1] < FEW or x.ndim == 1:
+    if jax.default_matmul_precision.value not in BFLOAT16 or w.shape[-1] < FEW or x.ndim == 1:
         return x @ w
     return _rounded_product(x, w)
 
