@@ -114,39 +114,41 @@ class AnyAge:
             return self.learner.update(state, windows, key, count)
         age_key, update_key = jax.random.split(key)
         weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
-        improve = functools.partial(self.improve_actor, windows, self.younger(windows, age_key), weight)
+        younger = None if self.second_age == "none" else self.younger(windows, age_key)
+        improve = functools.partial(self.improve_actor, windows, younger, weight)
         state, metrics = self.learner.update(state, windows, update_key, count, improve)
         return state, metrics | {"pull_weight": weight}
 
     def younger(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
-        """Return x^(j)_t of each window, j uniform on 0..d, or 0, or d itself, as the actor sees it."""
+        """Return x^(j)_t of each window, j uniform on 0..d, or 0, as the actor sees it."""
         age = windows.age[:, windows.delay]
         share = jax.random.uniform(key, age.shape) if self.second_age == "random" else jnp.zeros(age.shape)
-        ages = age if self.second_age == "none" else jnp.floor(share * (age + 1)).astype(jnp.int32)
+        ages = jnp.floor(share * (age + 1)).astype(jnp.int32)
         return jax.vmap(lambda window, age: network_input(view(window, age=age), "augmented"))(windows, ages)
 
     def improve_actor(
         self,
         windows: Window,
-        younger: Array,
+        younger: Array | None,
         weight: Array,
         state: State,
         actor_input: Array,
         critic_input: Array,
         key: Key,
     ) -> State:
-        """Take one gradient step on the actor: half for each age, the pull of the older one, its encoder's loss."""
-        temperature, both_ages = jnp.exp(state.log_temperature), jnp.stack([actor_input, younger])
-        same_states = jnp.stack([critic_input, critic_input])
+        """Take one gradient step on the actor: as much for each age, the pull of the older one, its encoder's loss."""
+        x = jnp.stack([actor_input] if younger is None else [actor_input, younger])
+        states, temperature = jnp.stack([critic_input] * len(x)), jnp.exp(state.log_temperature)
 
         def loss(actor: Params) -> tuple[Array, None]:
-            policy = self.learner.policy(actor, both_ages)
+            policy = self.learner.policy(actor, x)
             action, log_prob = networks.sample(policy, key)
-            q = networks.twin(state.critic, same_states, action)
+            q = networks.twin(state.critic, states, action)
             total = -soft_value(q, log_prob, temperature).mean()
-            total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
+            if younger is not None:
+                total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.encoder == "forecast":
-                total += forecast_loss(actor, both_ages, same_states)
+                total += forecast_loss(actor, x, states)
             if self.belief_weight:
                 total += self.belief_weight * belief_loss(actor, actor_input, windows)
             return total, None
@@ -154,7 +156,7 @@ class AnyAge:
         adam = optax.adam(self.bpql.actor_learning_rate)
         actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)
         if self.encoder == "forecast":
-            actor = follow_changes(actor, both_ages, same_states)
+            actor = follow_changes(actor, x, states)
         return state._replace(actor=actor, actor_opt_state=opt_state)
 
     def distance(self, older: Gaussian, younger: Gaussian) -> Float[Array, ""]:
