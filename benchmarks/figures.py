@@ -19,6 +19,7 @@ from PIL import Image
 from speed import tables as speed
 
 from delayrl.cli.main import main as delayrl
+from delayrl.report.statistics import Stratum, stratified_bootstrap
 
 HERE = Path(__file__).parent
 COLOURS = {
@@ -83,19 +84,26 @@ def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any
 
 
 def table(name: str) -> str:
-    """Return a Markdown table of each agent's returns on unseen start states, by seed and normalised."""
+    """Return a Markdown table of each agent's returns on unseen start states, by seed and normalised.
+
+    The interval of a normalised return is a bootstrap over the agent's seeds and those of both anchors.
+    """
     by_agent = evaluations(name)
     means = {agent: [e["mean_return"] for _, e in runs] for agent, runs in by_agent.items()}
     anchors = "sac" in means and "random" in means
-    titles = ["agent", "mean return", *(["normalised"] if anchors else []), "each seed", "delay", "steps"]
+    normalised = ["normalised, 95 % interval"] if anchors else []
+    titles = ["agent", "mean return", *normalised, "each seed", "delay", "steps"]
     lines = ["| " + " | ".join(titles) + " |", "| --- " * len(titles) + "|"]
     for agent, runs in sorted(by_agent.items(), key=lambda item: -np.mean(means[item[0]])):
         config, evaluation = runs[0]
         seeds = " · ".join(f"{mean:.1f}" for mean in means[agent])
         cells = [f"`{agent}`", f"{np.mean(means[agent]):.1f}"]
         if anchors:
-            low, high = np.mean(means["random"]), np.mean(means["sac"])
-            cells.append(f"{(np.mean(means[agent]) - low) / (high - low):.2f}")
+            low, high = np.array(means["random"]), np.array(means["sac"])
+            value = (np.mean(means[agent]) - low.mean()) / (high.mean() - low.mean())
+            ends = stratified_bootstrap([Stratum(low, high, [np.array(means[agent])])], lambda x: x.mean(-1))
+            known = agent not in ("random", "sac") and np.isfinite(ends).all()
+            cells.append(f"{value:.2f}" + (f" ({ends[0]:.2f} to {ends[1]:.2f})" if known else ""))
         cells += [seeds, evaluation["delay"], f"{config['schedule']['steps']:,}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)

@@ -194,7 +194,8 @@ def test_page_marks_what_goes_on(opened: Any) -> None:
     assert "todo" in states
     assert "1 running, 1 failed, 1 todo" in view.locator("#state").inner_text()
     assert "at 400,000 of 1,000,000 steps" in view.locator("#normalised-0").inner_text()
-    assert "paper 0.56 ± 0.06" in view.locator("#normalised-0").inner_text()
+    assert "paper 0.72 ± 0.03" in view.locator("#normalised-0").inner_text()
+    assert "paper 0.56 ± 0.06" not in view.locator("#normalised-0").inner_text()  # of the cell that runs
 
 
 def test_page_in_light_and_dark(opened: Any, tmp_path: Path) -> None:

@@ -4,10 +4,12 @@ import math
 from typing import Any
 
 import pytest
-from synthetic import small, standing
+from synthetic import rows, small, standing
 
 from delayrl.report.summary import summarise
 from delayrl.report.tables import published_values
+from delayrl.run.condition import resolve
+from delayrl.run.rows import CONFIGURATION
 
 
 def test_columns_that_were_not_run_are_empty_beside_the_papers_value() -> None:
@@ -45,6 +47,24 @@ def test_the_papers_values_stand_only_beside_runs_like_the_papers(changes: dict[
             assert [published[label] for label in ("vdpo", "bpql")] == [None, None]
         else:
             assert published == {"vdpo": None, "bpql": None}
+
+
+@pytest.mark.parametrize(
+    ("known", "ended", "steps"), [(False, True, 10**6), (True, False, 10**6), (True, True, 2 * 10**6)]
+)
+def test_the_papers_values_stand_beside_whole_runs_of_known_options(known: bool, ended: bool, steps: int) -> None:
+    """Neither beside rows without a configuration, nor a part of a run, nor a longer one."""
+    for whole in (True, False):
+        end = 10**6 if whole else steps
+        cell = standing(
+            "vdpo", "delayrl/Ant-v4", 5, preset="paper", steps=end, step=end if whole or ended else end // 2
+        )
+        own = [row | {"cell": None, CONFIGURATION: "a" * 64} for row in rows([cell], 10, 1)]
+        config = resolve("vdpo", "delayrl/Ant-v4", 5, "paper", "corrected", {"steps": end}).config
+        config |= {CONFIGURATION: "a" * 64}
+        for table in summarise(own, [], [config] if whole or known else []).tables:
+            published = table.entries["delayrl/Ant-v4", 5, "vdpo"].published
+            assert (published is not None) == whole, table.kind
 
 
 def test_the_ablation_shows_no_value_of_another_variant() -> None:

@@ -82,6 +82,7 @@ class Result:
     privileged: bool  # whether its behaviour reads the true state while it trains
     curves: Curves  # of the complete seeds; where there is none yet, of all
     cost: Cost | None = None  # of learning, where its runs say so
+    options_known: bool = True  # whether a grid or the configurations of all its runs say its options
     random_anchor: Anchor = NO_ANCHOR  # its returns are normalised by this
     reference_anchor: Anchor = NO_ANCHOR  # and by this
 
@@ -181,9 +182,9 @@ def delay_order(delay: int | str) -> tuple[bool, int, str]:
 
 
 def make_results(
-    standing: Standing, group_of: Mapping[str, RowGroup], labels: Mapping[str, str]
+    standing: Standing, group_of: Mapping[str, RowGroup], labels: Mapping[str, str], *, inferred: bool
 ) -> dict[Place, Result]:
-    """Make a result with its anchors of all cells that differ in nothing but their seeds."""
+    """Make a result with its anchors of all cells that differ in nothing but their seeds; of rows or of a grid."""
     members: dict[Place, list[tuple[Cell, Progress]]] = defaultdict(list)
     for cell, progress in sorted(standing, key=lambda item: item[0].id):
         condition = cell.condition
@@ -192,7 +193,7 @@ def make_results(
         if any(set(other.seeds) & set(cell.seeds) for other, _ in members[place]):  # the same seeds again
             place = place._replace(label=f"{place.label} #{cell.id[:8]}")
         members[place].append((cell, progress))
-    results = [_result(place, cells, group_of) for place, cells in members.items()]
+    results = [_result(place, cells, group_of, inferred=inferred) for place, cells in members.items()]
     return {result.place: _anchored(result, results) for result in sorted(results, key=_order)}
 
 
@@ -201,7 +202,7 @@ def _order(result: Result) -> tuple[Any, ...]:
     return place.setting, place.env, delay_order(place.delay), agent_order(place.label)
 
 
-def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup]) -> Result:
+def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup], *, inferred: bool) -> Result:
     """Complete seeds count; until there is one, all of them count as partial."""
     groups = [group_of[cell.id] for cell, _ in standing if cell.id in group_of]
     runs = {seed: run for group in groups for seed, run in group.runs("agent").items()}
@@ -219,6 +220,7 @@ def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup]) 
         any(group.privileged for group in groups),
         Curves(*statistics.common_steps([runs[seed] for seed in sorted(kept)])),
         next((group.cost for group in groups if group.cost), None),
+        not inferred or all(group.config for group in groups),
     )
 
 

@@ -80,6 +80,7 @@ def summarise(
     groups, known = group_rows(rows), by_key(configs)
     for group in groups:
         group.config = known.get(group.key, {})
+    inferred = not standing
     if standing:
         unplaced, placed = _place_groups(groups, [cell for cell, _ in standing])
     else:
@@ -89,7 +90,7 @@ def summarise(
         if group_of.setdefault(id, group) is not group:
             raise DelayRLError(f"the rows of cell {id} are of different things: {group_of[id].key} and {group.key}")
     labels, shared = _label_cells([cell for cell, _ in standing])
-    results = make_results(standing, group_of, labels)
+    results = make_results(standing, group_of, labels, inferred=inferred)
     return Summary(results, shared, make_tables(results), _make_aggregates(results.values()), unplaced)
 
 

@@ -91,10 +91,10 @@ def make_tables(results: Mapping[Place, Result]) -> list[Table]:
 
 
 def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], results: Mapping[Place, Result]) -> Table:
-    """Lay out the chosen results. The paper's columns and values are there only if all have its preset and budget."""
+    """Lay out the chosen results. The paper's columns are there only if all have its preset and budget."""
     rows = sorted({(r.place.env, r.place.delay) for r in chosen}, key=lambda row: (row[0], delay_order(row[1])))
     columns = {r.place.label for r in chosen}
-    comparable = setting.preset == "paper" and all(r.condition.steps >= PAPER_STEPS for r in chosen)
+    comparable = setting.preset == "paper" and all(r.condition.steps == PAPER_STEPS for r in chosen)
     values = published_values() if comparable else {}
     in_paper = {(task, delay) for _, task, delay, *_ in values}
     if kind != "ablation" and any((env.removeprefix("delayrl/"), str(delay)) in in_paper for env, delay in rows):
@@ -110,9 +110,15 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], resul
             representation = ""  # only values of the ablation name one
         measure = "steps" if kind == "steps" else "normalised"
         key = (measure, env.removeprefix("delayrl/"), str(delay), agent, representation)
-        published = values.get(key) if overrides.keys() <= SAME_RUN else None  # the paper ran no other variants
-        entries[env, delay, label] = _entry(kind, results.get(Place(setting, env, delay, label)), published)
+        result = results.get(Place(setting, env, delay, label))
+        same = overrides.keys() <= SAME_RUN and (result is None or _is_whole(result))  # the paper ran no other variants
+        entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None)
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
+
+
+def _is_whole(result: Result) -> bool:
+    """Whether the paper's value may stand beside it: no run yet, or runs to the end with options that are known."""
+    return not result.runs or (result.options_known and not result.partial)
 
 
 def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) -> TableEntry:
