@@ -237,6 +237,19 @@ def test_who_may_look(auxiliary_delay: int) -> None:
     np.testing.assert_array_equal(*modes)
 
 
+def test_evaluated_action() -> None:
+    """The mode; with `sample`, as the released code has it, a draw. Both are the augmented actor's."""
+    agent, state = started()
+    what, key = seen(0, truth=False), jax.random.key(7)
+    x = jnp.concatenate([what.obs, what.actions.reshape(-1), jnp.ones(1)])
+    policy = TINY.policy(state.actor, x)
+    drawn, _ = networks.sample(policy, jax.random.split(key)[1])
+    assert not np.allclose(drawn, networks.mode(policy), atol=1e-3)
+    for evaluation, expected in (("mode", networks.mode(policy)), ("sample", drawn)):
+        action = dataclasses.replace(agent, evaluation=evaluation).act(state, what, key, explore=False)
+        np.testing.assert_allclose(action, expected, atol=1e-6)
+
+
 def test_delay_free_policy_inside() -> None:
     agent, state = started()
     reference, inner = agent.reference_policy(state)

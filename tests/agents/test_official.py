@@ -15,6 +15,7 @@ from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS
 from delayrl.core import networks
 from delayrl.core import replay as ring
+from delayrl.core.protocol import CORRECTED
 from delayrl.core.types import Spec
 from delayrl.envs import make
 from delayrl.play.policy import spec_of
@@ -31,11 +32,15 @@ def official(agent: str):
 
 
 def test_the_page_says_what_is_done() -> None:
-    """Its column "here" for each agent is made of the registry's values."""
+    """Its line for each agent, and the one for `corrected`, are made of the registry's values."""
     text = PAGE.read_text()
-    for agent in AGENTS:
-        setup = official(agent)
-        rules, given = setup.protocol, setup.schedule
+    ours = [resolve(agent, "Reacher-v5", 0 if agent == "sac" else DELAY, "paper", "corrected", {}) for agent in AGENTS]
+    assert all(setup.protocol == CORRECTED for setup in ours)
+    setups = [("all, `corrected`", ours[0]), *((f"`{agent}`", official(agent)) for agent in AGENTS)]
+    for name, setup in setups:
+        agent, rules, given = name.strip("`"), setup.protocol, setup.schedule
+        first = "the preset's" if rules == CORRECTED else f"{given.first_update:,}"
+        unit = setup.config["hyperparameters"].get("entropy_unit", "–")
         habits = [
             rules.start_states,
             rules.time_limit,
@@ -43,18 +48,18 @@ def test_the_page_says_what_is_done() -> None:
             rules.evaluation_opening,
             "opening" if rules.opening_steps == "dropped" else "last" if rules.last_starts == "dropped" else "none",
             rules.capacity,
+            unit if rules != CORRECTED else "the preset's",
             getattr(setup.agent, "evaluation", "mode") if agent not in ("random",) else "random",
-            f"{given.first_update:,}" if agent != "random" else "never",
+            first if agent != "random" else "never",
         ]
-        line = re.search(rf"^\| `{agent}` \|(.*)\|$", text, re.M)
+        line = re.search(rf"^\| {re.escape(name)} \|(.*)\|$", text, re.M)
         assert line, agent
         assert [cell.strip(" `") for cell in line[1].split("|")] == habits, agent
 
 
 def test_entropies_are_in_the_tasks_units() -> None:
-    for agent in AGENTS:
-        options = official(agent).config["hyperparameters"]
-        assert options.get("entropy_unit", "task") == "task"
+    units = {agent: official(agent).config["hyperparameters"].get("entropy_unit") for agent in AGENTS}
+    assert {agent for agent, unit in units.items() if unit != "task"} == {"dcac", "random"}  # which have no option
     for agent in ("sac", "vdpo", "bpql"):
         small = resolve(agent, "Pusher-v5", 3, "small", "official", {}).config["hyperparameters"]
         assert small["entropy_unit"] == "task"
@@ -202,7 +207,7 @@ def test_what_is_learned_from() -> None:
         assert drawn - unfinished == expected - unfinished
 
 
-def test_capacity_counts_entries() -> None:
+def test_capacity_counts_entries(tmp_path: Path) -> None:
     """VDPO's code holds 1,000,000 entries, three for each step."""
     spec = Spec(OBS, ACT, DELAY)
     assert [1_000_000 // official(agent).entries(spec) for agent in ("vdpo", "a-sac", "bpql")] == [
@@ -210,6 +215,10 @@ def test_capacity_counts_entries() -> None:
         333_333,
         1_000_000,
     ]
+    for protocol, rows in (("official", 30), ("corrected", 90)):
+        run = train("a-sac", tmp_path / protocol, protocol=protocol, steps=160, evaluate_every=160, replay_capacity=90)
+        pieces = [path.stem.split("-") for path in (run.path / "replay").iterdir()]
+        assert max(int(end) for _, end in pieces) - min(int(first) for first, _ in pieces) == rows - 1, protocol
 
 
 def test_the_habits_are_part_of_a_run(tmp_path: Path) -> None:
