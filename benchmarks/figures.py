@@ -18,8 +18,13 @@ from matplotlib import pyplot
 from PIL import Image
 from speed import tables as speed
 
+from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
+from delayrl.envs import make
+from delayrl.play.policy import spec_of
 from delayrl.report.statistics import Stratum, stratified_bootstrap
+from delayrl.run.condition import resolve
+from delayrl.training.cost import cost_of
 
 HERE = Path(__file__).parent
 COLOURS = {
@@ -164,6 +169,28 @@ def overhead() -> str:
     )
 
 
+def costs(env: str, delays: tuple[int, ...]) -> str:
+    """Return a Markdown table of what each agent's learning costs with the preset `matched`; nothing is run."""
+    titles = ["agent", "reads the true state", "parameters", "gradient steps"]
+    titles += [f"GFLOP, Δ = {delay}" for delay in delays]
+    lines = ["| " + " | ".join(titles) + " |", "| --- " * len(titles) + "|"]
+    specs = {delay: spec_of(make(env, delay, rescale=True)) for delay in (0, *delays)}
+    variants = [*((agent, {}) for agent in AGENTS if agent != "random"), ("any-age", {"encoder": "forecast"})]
+    for agent, overrides in variants:
+        own = [0] * len(delays) if agent == "sac" else delays
+        setups = [resolve(agent, env, delay, "matched", "corrected", overrides) for delay in own]
+        known = [cost_of(x.agent, specs[delay], x.schedule) for x, delay in zip(setups, own, strict=True)]
+        alike: dict[str, list[str]] = {}
+        for name, number in known[-1].gradient_steps.items():
+            alike.setdefault(f"{number:.2g}", []).append(name)
+        steps = "; ".join(f"{number} × {', '.join(names)}" for number, names in alike.items())
+        words = ", ".join([f"`{agent}`", *(f"`{name}={value}`" for name, value in overrides.items())])
+        words += ", no delay" if agent == "sac" else ""
+        cells = [words, "in training" if setups[-1].agent.privileged else "no", f"{known[-1].parameters:,}", steps]
+        lines.append("| " + " | ".join([*cells, *(f"{cost.flops / 1e9:.2f}" for cost in known)]) + " |")
+    return "\n".join(lines) + f"\n\n{env}, for each environment step of one seed; parameters at Δ = {delays[-1]}."
+
+
 def udp_table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table of the UDP demonstration: each network and controller over its episodes."""
     head, rows = lines[0], [line for line in lines if "statistics" in line]
@@ -279,6 +306,7 @@ def main() -> None:
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
+    insert(root / "docs" / "performance.md", "costs", costs("HalfCheetah-v5", (5, 25, 50)))
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)
 
