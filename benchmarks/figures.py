@@ -17,6 +17,7 @@ from learning import curves as learning
 from matplotlib import pyplot
 from PIL import Image
 from speed import tables as speed
+from times import tables as times
 
 from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
@@ -306,6 +307,9 @@ def main() -> None:
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
+    if list((HERE / "results" / "times").glob("*.jsonl")):
+        text = times.section(HERE / "results" / "times", images / "times.png")
+        insert(root / "docs" / "performance.md", "times", text)
     insert(root / "docs" / "performance.md", "costs", costs("HalfCheetah-v5", (5, 25, 50)))
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)
