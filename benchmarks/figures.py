@@ -9,6 +9,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import ladder
 import matplotlib
 import numpy as np
 
@@ -23,7 +24,7 @@ from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
 from delayrl.envs import make
 from delayrl.play.policy import spec_of
-from delayrl.report.statistics import Stratum, stratified_bootstrap
+from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
 from delayrl.run.condition import resolve
 from delayrl.training.cost import cost_of
 
@@ -151,6 +152,24 @@ def provenance(name: str) -> str:
         f"commit {', '.join(commits)}. "
         f"Rows: `benchmarks/results/{name}.jsonl`."
     )
+
+
+def entropies(name: str) -> str:
+    """Return a Markdown table of what the unit of entropies changes, for runs that differ in nothing else."""
+    configs, rows, _ = read(name)
+    episodes: dict[str, dict[int, dict[int, list[float]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for row in rows:
+        unit = configs[row["run"]]["hyperparameters"]["entropy_unit"]
+        episodes[unit][configs[row["run"]]["seed"]][row["step"]].append(row["return"])
+    lines = ["| `--entropy-unit` | seeds | mean return over training | after training |", "| --- | --- | --- | --- |"]
+    for unit, seeds in sorted(episodes.items()):
+        steps, returns = common_steps([{step: float(np.mean(x)) for step, x in run.items()} for run in seeds.values()])
+        columns = (area(steps, returns), returns[:, -1])
+        cells = [f"`{unit}`", str(len(returns)), *(f"{x.mean():.1f} ± {x.std(ddof=1):.1f}" for x in columns)]
+        lines.append("| " + " | ".join(cells) + " |")
+    one = configs[0]
+    about = f"{one['env']}, `{one['agent']}`, preset `{one['preset']}`, {one['schedule']['steps']:,} steps"
+    return "\n".join(lines) + f"\n\n{about}. Rows: `benchmarks/results/{name}.jsonl`."
 
 
 def overhead() -> str:
@@ -292,6 +311,7 @@ def main() -> None:
         if (HERE / "results" / f"{name}.jsonl").exists():
             for page in pages:
                 insert(root / page, name, table(name) + "\n\n" + provenance(name))
+    insert(root / "docs" / "protocols.md", "entropies", entropies("pusher-entropy"))
     if (HERE / "results" / "overhead.jsonl").exists():
         insert(root / "docs" / "delays.md", "overhead", overhead())
     udp, overruns = (
@@ -307,6 +327,8 @@ def main() -> None:
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
+    if (rows := HERE / "results" / "any-age-ladder.sqlite").exists():
+        insert(root / "docs" / "algorithms" / "any-age.md", "ladder", ladder.section(rows, images / "ladder.png"))
     if list((HERE / "results" / "times").glob("*.jsonl")):
         text = times.section(HERE / "results" / "times", images / "times.png")
         insert(root / "docs" / "performance.md", "times", text)

@@ -1,0 +1,74 @@
+"""The ladder of any-age: what each part brings, from the rows of the grid `any-age-ladder`; cells that have ended."""
+
+from pathlib import Path
+
+import numpy as np
+from learning.curves import difference, spread
+from matplotlib import pyplot
+
+from delayrl.bench.results import read_table
+from delayrl.report import statistics
+from delayrl.report.results import Result
+from delayrl.report.summary import summarise
+
+AWAY = 1_500
+"""Seeds that end above this return have left the gaits on the back or creeping, at 900 to 1,450."""
+BASE = "bpql"
+
+
+def section(file: Path, picture: Path) -> str:
+    """Draw the curves, and return the table with what made it."""
+    collected = read_table(file)
+    cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
+    results = [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
+    learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
+    draw(learners, picture)
+    versions = collected.versions[0]
+    made = f"{versions['cores']} x86 cores, jax {versions['jax']}, MuJoCo {versions['mujoco']}"
+    return f"{table(learners)}\n\n{made}. Rows: `benchmarks/results/{file.name}`."
+
+
+def area(result: Result) -> statistics.Floats:
+    """Return each seed's mean return over training."""
+    return statistics.area(*result.curves)
+
+
+def name(result: Result) -> str:
+    """Return the arm in words: the agent, its delay if none, its preset if another, and its options."""
+    condition = result.condition
+    words = [f"`{condition.agent}`", *(["no delay"] if result.place.delay == 0 else [])]
+    words += ["its released settings"] if condition.preset == "paper" else []
+    shown = {k: v for k, v in condition.overrides.items() if k != "precision"} if condition.preset != "paper" else {}
+    return ", ".join([*words, *(f"`{key}={value}`" for key, value in shown.items())])
+
+
+def table(results: list[Result]) -> str:
+    """Return a Markdown table of the arms, compared with BPQL on the same SAC."""
+    base = next((area(r) for r in results if name(r) == f"`{BASE}`"), None)
+    head = ["arm", "seeds", "mean return over training", "times BPQL's", "difference, 95 % interval", "at the end"]
+    lines = ["| " + " | ".join([*head, f"seeds above {AWAY:,}"]) + " |", "|" + " --- |" * (len(head) + 1)]
+    for result in results:
+        own, final = area(result), result.curves.final
+        compared = base is not None and name(result) != f"`{BASE}`"
+        times = f"{own.mean() / base.mean():.2f}" if compared and base is not None else ""
+        apart = difference(own, base) if compared else ""
+        cells = [name(result), str(result.runs), spread(own), times, apart, spread(final)]
+        lines.append("| " + " | ".join([*cells, f"{int((final > AWAY).sum())} of {final.size}"]) + " |")
+    return "\n".join(lines)
+
+
+def draw(results: list[Result], out: Path) -> None:
+    """Draw return against steps: the mean over seeds, and a thin line for each seed."""
+    figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
+    for number, result in enumerate(results):
+        steps, returns = result.curves
+        colour = f"C{number % 10}"
+        axes.plot(steps, returns.T, color=colour, alpha=0.2, linewidth=0.8)
+        axes.plot(steps, returns.mean(0), color=colour, linewidth=2.2, label=name(result).replace("`", ""))
+    axes.set(xlabel="environment steps", ylabel="return", title="HalfCheetah-v5, 25 steps late, five seeds")
+    axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in results]))))
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(out, dpi=130)
+    pyplot.close(figure)
