@@ -15,10 +15,10 @@ import numpy as np
 
 matplotlib.use("Agg")
 from learning import curves as learning
+from learning import times
 from matplotlib import pyplot
 from PIL import Image
 from speed import tables as speed
-from times import tables as times
 
 from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl

@@ -13,6 +13,7 @@ import json
 import os
 import platform
 import time
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+COMMON = ("gymnasium", "mujoco", "numpy")
+PACKAGES = {"sb3": (*COMMON, "stable-baselines3", "torch"), "sbx": (*COMMON, "sbx-rl", "jax")}
 EVALUATION = 1
 """The stream of start states that evaluation uses (delayrl's `reset_seed`)."""
 
@@ -59,7 +62,7 @@ def main() -> None:
         **options,
     )
     settings = {"library": given.library, "env": given.env, "seed": given.seed, "steps": given.steps}
-    lines: list[dict[str, Any]] = [{"config": settings, "versions": versions(given.library)}]
+    lines: list[dict[str, Any]] = [{"config": settings, "versions": versions(PACKAGES[given.library])}]
     envs = [gymnasium.make(given.env) for _ in range(given.episodes)]
     began, playing = time.perf_counter(), 0.0
     for step in range(given.evaluate_every, given.steps + 1, given.evaluate_every):
@@ -99,16 +102,11 @@ def reset_seed(seed: int, *stream: int) -> int:
     return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0] >> 1)
 
 
-def versions(library: str) -> dict[str, Any]:
-    """Libraries and hardware."""
-    names = [
-        "gymnasium",
-        "mujoco",
-        "numpy",
-        *({"sb3": ["stable-baselines3", "torch"], "sbx": ["sbx-rl", "jax"]}[library]),
-    ]
-    found: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count()}
-    for name in names:
+def versions(packages: Sequence[str]) -> dict[str, Any]:
+    """Return the versions of packages, None where one is missing, and the hardware."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    found: dict[str, Any] = {"python": platform.python_version(), "cores": cores}
+    for name in packages:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""One side's return against wall-clock: `python side.py any-age HalfCheetah-v5 --delay 25 --minutes 20 --out DIR`.
+"""One side's return against wall-clock: `python timed.py any-age HalfCheetah-v5 --delay 25 --minutes 20 --out DIR`.
 
 Sides are our agents by name; `sb3` and `sbx`, those libraries' SAC with their defaults on `AugmentedObservation`; and
 `released`, VDPO's code with its own sizes and evaluation (`--code PATH`). Each runs in an environment that has it; all
@@ -8,20 +8,19 @@ compiling included, and stands still while a policy is evaluated.
 
 import argparse
 import json
-import os
-import platform
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from peer import play, versions
 
 EPISODES = 10
+PACKAGES = ("delayrl", "gymnasium", "jax", "mujoco", "numpy", "sbx-rl", "stable-baselines3", "torch")
 NEVER = 10**9
 
 
@@ -70,7 +69,7 @@ def main() -> None:
         return
     given.out.mkdir(parents=True, exist_ok=True)
     config = {name: value for name, value in vars(given).items() if name not in ("out", "code")}
-    lines: list[dict[str, Any]] = [{"config": config, "versions": versions()}]
+    lines: list[dict[str, Any]] = [{"config": config, "versions": versions(PACKAGES)}]
     clock = Clock()
 
     def record(step: int, value: float | None) -> bool:
@@ -139,22 +138,9 @@ def library(given: argparse.Namespace, clock: Clock, record: Record) -> None:
     for step in range(given.evaluate_every, NEVER, given.evaluate_every):
         model.learn(given.evaluate_every, reset_num_timesteps=False)
         with clock.paused():
-            value = np.mean(play(model, envs, 1_000_000 + 1_000 * given.seed))
+            value = np.mean(play(model, envs, [1_000_000 + 1_000 * given.seed + i for i in range(EPISODES)]))
         if record(step, float(value)):
             return
-
-
-def play(model: Any, envs: list[Any], first_seed: int) -> list[float]:
-    """Undiscounted returns of deterministic episodes, all stepped together."""
-    seen = np.stack([env.reset(seed=first_seed + i)[0] for i, env in enumerate(envs)])
-    returns, running = np.zeros(len(envs)), np.ones(len(envs), bool)
-    while running.any():
-        actions, _ = model.predict(seen, deterministic=True)
-        for i in np.flatnonzero(running):
-            seen[i], reward, terminated, truncated, _ = envs[i].step(actions[i])
-            returns[i] += float(reward)
-            running[i] = not (terminated or truncated)
-    return [float(value) for value in returns]
 
 
 def released(given: argparse.Namespace, clock: Clock, record: Record) -> None:
@@ -198,18 +184,6 @@ def released(given: argparse.Namespace, clock: Clock, record: Record) -> None:
 
 class TimeOverError(Exception):
     """The given time is over."""
-
-
-def versions() -> dict[str, Any]:
-    """Return libraries and hardware."""
-    names = ("delayrl", "gymnasium", "jax", "mujoco", "numpy", "sbx-rl", "stable-baselines3", "torch")
-    found: dict[str, Any] = {"python": platform.python_version(), "cores": len(os.sched_getaffinity(0))}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found | {"machine": f"{platform.system()} {platform.machine()}"}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Tables and the picture of returns against wall-clock, from the rows of side.py."""
+"""Tables and the picture of returns against wall-clock, from the rows of timed.py."""
 
 import json
 from collections import defaultdict
