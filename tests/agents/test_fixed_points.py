@@ -273,7 +273,7 @@ def test_any_age_ends_where_its_pull_leaves_it(weight: float, distance: Any) -> 
     constant = {"pull_hold": 1.0, "pull_end": 1.0, "run_steps": 10**6, "second_age": "zero"}
     agent = AnyAge(bpql, pull_weight=weight, pull=distance, **constant)
     state = agent.init(Spec(STATES, 1, 1), jax.random.key(1))
-    for rate, updates in ((1e-2, 600), (1e-3, 300)):
+    for rate, updates in ((1e-2, 1200), (1e-3, 300)):
         agent = replace(agent, bpql=with_options(bpql, actor_learning_rate=rate, critic_learning_rate=rate))
         state = run(agent.update, state, windows(1), updates)
     np.testing.assert_allclose(q_table(state.critic), [solution.q[:, AT_ACTIONS]] * 2, atol=Q_MARGIN)
