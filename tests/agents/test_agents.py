@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, DELAYED, ENV, OBS, program_of, same, seen, trained
+from learners import ACT, DELAYED, ENV, OBS, program_of, same, seen, trained
 
 from conftest import TINY, learned, quick, record
 from delayrl.agents.normalised import NormalisedObservations

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, OBS, counted, random_windows, record, same, seen, trained
+from learners import ACT, OBS, counted, random_windows, record, same, seen, trained
 
 from conftest import TINY
 from delayrl.agents.any_age import AnyAge, belief_loss

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, ENV, OBS, random_windows, same, seen, trained
+from learners import ACT, ENV, OBS, random_windows, same, seen, trained
 
 import delayrl
 from conftest import TINY, record

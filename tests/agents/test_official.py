@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, OBS, seen
+from learners import ACT, OBS, seen
 
 import delayrl
 from conftest import TINY, TINY_SAC, record

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from learning import ACT, ENV, OBS, counted, random_windows, same, seen, trained
+from learners import ACT, ENV, OBS, counted, random_windows, same, seen, trained
 
 from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learning import ACT, ENV, OBS, counted, random_windows, same, seen
+from learners import ACT, ENV, OBS, counted, random_windows, same, seen
 
 from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS
