@@ -26,6 +26,7 @@ from delayrl.cli.main import main as delayrl
 from delayrl.envs import make
 from delayrl.play.policy import spec_of
 from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
+from delayrl.report.wording import gradient_steps
 from delayrl.run.condition import resolve
 from delayrl.training.cost import cost_of
 
@@ -201,13 +202,10 @@ def costs(env: str, delays: tuple[int, ...]) -> str:
         own = [0] * len(delays) if agent == "sac" else delays
         setups = [resolve(agent, env, delay, "matched", "corrected", overrides) for delay in own]
         known = [cost_of(x.agent, specs[delay], x.schedule) for x, delay in zip(setups, own, strict=True)]
-        alike: dict[str, list[str]] = {}
-        for name, number in known[-1].gradient_steps.items():
-            alike.setdefault(f"{number:.2g}", []).append(name)
-        steps = "; ".join(f"{number} × {', '.join(names)}" for number, names in alike.items())
         words = ", ".join([f"`{agent}`", *(f"`{name}={value}`" for name, value in overrides.items())])
         words += ", no delay" if agent == "sac" else ""
-        cells = [words, "in training" if setups[-1].agent.privileged else "no", f"{known[-1].parameters:,}", steps]
+        privileged = "in training" if setups[-1].agent.privileged else "no"
+        cells = [words, privileged, f"{known[-1].parameters:,}", gradient_steps(known[-1])]
         lines.append("| " + " | ".join([*cells, *(f"{cost.flops / 1e9:.2f}" for cost in known)]) + " |")
     return "\n".join(lines) + f"\n\n{env}, for each environment step of one seed; parameters at Δ = {delays[-1]}."
 

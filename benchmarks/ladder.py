@@ -37,9 +37,9 @@ def name(result: Result) -> str:
     """Return the arm in words: the agent, its delay if none, its preset if another, and its options."""
     condition = result.condition
     words = [f"`{condition.agent}`", *(["no delay"] if result.place.delay == 0 else [])]
-    words += ["its released settings"] if condition.preset == "paper" else []
-    shown = {k: v for k, v in condition.overrides.items() if k != "precision"} if condition.preset != "paper" else {}
-    return ", ".join([*words, *(f"`{key}={value}`" for key, value in shown.items())])
+    if condition.preset == "paper":
+        return ", ".join([*words, "its released settings"])
+    return ", ".join([*words, *(f"`{k}={v}`" for k, v in condition.overrides.items() if k != "precision")])
 
 
 def table(results: list[Result]) -> str:

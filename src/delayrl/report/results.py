@@ -184,7 +184,10 @@ def delay_order(delay: int | str) -> tuple[bool, int, str]:
 def make_results(
     standing: Standing, group_of: Mapping[str, RowGroup], labels: Mapping[str, str], *, inferred: bool
 ) -> dict[Place, Result]:
-    """Make a result with its anchors of all cells that differ in nothing but their seeds; of rows or of a grid."""
+    """Make a result with its anchors of all cells that differ in nothing but their seeds.
+
+    Of cells that are inferred from rows, only configurations say the options; a grid's cells name their own.
+    """
     members: dict[Place, list[tuple[Cell, Progress]]] = defaultdict(list)
     for cell, progress in sorted(standing, key=lambda item: item[0].id):
         condition = cell.condition

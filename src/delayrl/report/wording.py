@@ -116,7 +116,7 @@ def costs(summary: Summary, setting: Setting) -> Sequence[tuple[str, ...]]:
     lines = []
     for label in sorted(known, key=agent_order):
         costs = [result.cost for result in known[label] if result.cost]
-        steps = " or ".join(dict.fromkeys(_gradient_steps(cost) for cost in costs))
+        steps = " or ".join(dict.fromkeys(gradient_steps(cost) for cost in costs))
         batches = " or ".join(dict.fromkeys(", ".join(dict.fromkeys(map(str, cost.batches))) for cost in costs))
         sizes = _range([cost.parameters for cost in costs]), _range([cost.flops for cost in costs])
         privileged = "in training" if any(result.privileged for result in known[label]) else "no"
@@ -124,7 +124,7 @@ def costs(summary: Summary, setting: Setting) -> Sequence[tuple[str, ...]]:
     return lines
 
 
-def _gradient_steps(cost: Cost) -> str:
+def gradient_steps(cost: Cost) -> str:
     """Write how often each optimiser steps; those that step alike are together."""
     names: dict[float, list[str]] = {}
     for name, number in cost.gradient_steps.items():
