@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 import delayrl
 from delayrl.core import networks
-from delayrl.core.forecast import forecasting
+from delayrl.core.forecast import forecast, forecasting
 from delayrl.core.networks import Params
 from delayrl.core.views import network_input, seen_now
 from delayrl.run.provenance import versions
@@ -45,7 +45,7 @@ def play(policy: Any, env_name: str, delay: int, outputs: Outputs) -> tuple[list
     spec, params = policy.spec, policy.state.actor
     # one for all episodes, so that they can be stepped together
     act = jax.jit(lambda x, truth: jnp.tanh(jnp.split(outputs(params, x, truth), 2, -1)[0]))
-    change = jax.jit(lambda x: params["deviation"] * networks.mlp(params["forecast"], x))
+    predict = jax.jit(lambda x: forecast(params, x))
     envs = [delayrl.make(env_name, delay, rescale=True, history=spec.delay) for _ in range(EPISODES)]
     late, infos = map(list, zip(*[env.reset(seed=FIRST_SEED + i) for i, env in enumerate(envs)], strict=True))
     returns, running = np.zeros(EPISODES), np.ones(EPISODES, bool)
@@ -55,8 +55,7 @@ def play(policy: Any, env_name: str, delay: int, outputs: Outputs) -> tuple[list
         x = np.stack([np.asarray(network_input(one._replace(truth=None), "augmented")) for one in seen])
         truth = np.stack([one.truth for one in seen])
         actions = np.asarray(act(x, truth))
-        now = x[:, : spec.obs_size] + np.asarray(change(x))
-        errors.append((now - truth)[running])
+        errors.append((np.asarray(predict(x)) - truth)[running])
         states.append(truth[running])
         for i in np.flatnonzero(running):
             late[i], reward, terminated, truncated, infos[i] = envs[i].step(actions[i])

@@ -23,10 +23,15 @@ def forecast_init(key: Key, spec: Spec, hidden: tuple[int, ...], outputs: int) -
     }
 
 
+def forecast(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch obs"]:
+    """Return the forecast of s_t: the observation in x_t plus its forecast change."""
+    change = params["deviation"] * mlp(params["forecast"], x)
+    return x[..., : change.shape[-1]] + change
+
+
 def forecasting(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
     """Apply the policy's MLP to the forecast of s_t, which it cannot change, and x_t."""
-    change = params["deviation"] * mlp(params["forecast"], x)
-    now = x[..., : change.shape[-1]] + change
+    now = forecast(params, x)
     return mlp(params["policy"], jnp.concatenate([jax.lax.stop_gradient(now), x], -1))
 
 
