@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from learning.curves import difference, spread
+from learning.curves import curve, difference, spread
 from matplotlib import pyplot
 
 from delayrl.bench.results import read_table
@@ -58,17 +58,13 @@ def table(results: list[Result]) -> str:
 
 
 def draw(results: list[Result], out: Path) -> None:
-    """Draw return against steps: the mean over seeds, and a thin line for each seed."""
+    """Draw the curves of the arms in one picture."""
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
     for number, result in enumerate(results):
         steps, returns = result.curves
-        colour = f"C{number % 10}"
-        axes.plot(steps, returns.T, color=colour, alpha=0.2, linewidth=0.8)
-        axes.plot(steps, returns.mean(0), color=colour, linewidth=2.2, label=name(result).replace("`", ""))
-    axes.set(xlabel="environment steps", ylabel="return", title="HalfCheetah-v5, 25 steps late, five seeds")
+        curve(axes, steps, returns, f"C{number % 10}").set_label(name(result).replace("`", ""))
+    axes.set_title("HalfCheetah-v5, 25 steps late, five seeds")
     axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in results]))))
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)

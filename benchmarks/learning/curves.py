@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib import pyplot
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from delayrl.report import statistics
 
@@ -87,20 +89,27 @@ def difference(one: statistics.Floats, other: statistics.Floats | None) -> str:
 
 
 def draw(runs: Runs, out: Path) -> None:
-    """Draw return against steps: the mean over seeds, and a thin line for each seed, a panel for each task."""
+    """Draw a panel of curves for each task."""
     figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 4.2), layout="constrained", squeeze=False)
     lines = {}
     for axes, (task, by_name) in zip(panels[0], sorted(runs.items()), strict=True):
         for who in sorted(by_name, key=list(COLOURS).index):
             steps, returns = statistics.common_steps(list(by_name[who].values()))
-            axes.plot(steps, returns.T, color=COLOURS[who], alpha=0.2, linewidth=0.8)
-            (lines[who],) = axes.plot(steps, returns.mean(0), color=COLOURS[who], linewidth=2.2)
-        axes.set(xlabel="environment steps", ylabel="return", title=f"{task}, no delay")
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+            lines[who] = curve(axes, steps, returns, COLOURS[who])
+        axes.set_title(f"{task}, no delay")
     figure.legend(lines.values(), lines, loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)
+
+
+def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: str) -> Line2D:
+    """Draw return against steps: the mean over seeds, which is returned, and a thin line for each seed."""
+    axes.plot(steps, returns.T, color=colour, alpha=0.2, linewidth=0.8)
+    (mean,) = axes.plot(steps, returns.mean(0), color=colour, linewidth=2.2)
+    axes.set(xlabel="environment steps", ylabel="return")
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    return mean
 
 
 def section(folder: Path, picture: Path) -> str:
