@@ -227,15 +227,6 @@ Floats linear(const Layer& layer, const Floats& x, std::size_t rows) {
 
 using Mlp = std::vector<Layer>;
 
-Floats mlp(const Mlp& layers, Floats x) {
-    for (std::size_t i = 0; i < layers.size(); ++i) {
-        x = linear(layers[i], x, 1);
-        if (i + 1 < layers.size())
-            for (float& value : x) value = std::max(value, 0.0f);
-    }
-    return x;
-}
-
 struct Norm {
     Floats scale, shift;
 
@@ -253,6 +244,17 @@ struct Norm {
         return x;
     }
 };
+
+// ReLU between the layers, and layer norms before it if there are any
+Floats mlp(const Mlp& layers, Floats x, const std::vector<Norm>& norms = {}) {
+    for (std::size_t i = 0; i < layers.size(); ++i) {
+        x = linear(layers[i], x, 1);
+        if (i < norms.size()) x = norms[i](std::move(x));
+        if (i + 1 < layers.size())
+            for (float& value : x) value = std::max(value, 0.0f);
+    }
+    return x;
+}
 
 // One attention head: query·key is x M x' + c·x', up to terms that cancel in the softmax; value and output are one matrix.
 struct Block {
@@ -281,17 +283,25 @@ class Policy {
         const std::size_t width = described.at("width").integer(0, 1e6), blocks = described.at("blocks").integer(0, 1000);
 
         const Weights weights(folder + "/policy.safetensors");
+        const std::size_t augmented = obs_size + max_age * action_size + 1;
         std::size_t read = obs_size;
         if (input_ != "observation" && max_age == 0) refuse("the policy's input needs an age");
         if (input_ == "augmented")
-            read += max_age * action_size + 1;
+            read = augmented;
+        else if (input_ == "forecast")
+            read += augmented;
         else if (input_ == "transformer")
             read = width;
         else if (input_ != "observation")
             refuse("the policy reads an input that this program does not support");
-        head_ = network(weights, "head", read, described.at("hidden"));
+        head_ = network(weights, "head", read, described.at("hidden"), action_size);
         if (described.at("current").kind == Json::list)
-            current_ = network(weights, "current", obs_size, described.at("current"));
+            current_ = network(weights, "current", obs_size, described.at("current"), action_size);
+        if (input_ == "forecast") {
+            forecast_ = network(weights, "forecast", augmented, described.at("forecast"), obs_size);
+            for (std::size_t i = 0; i + 1 < forecast_.size(); ++i)
+                norms_.push_back(norm(weights, "forecast." + std::to_string(i) + ".norm", forecast_[i].outputs));
+        }
         if (input_ == "transformer" && (current_.empty() || width == 0))
             refuse("a transformer needs a width, and a network for age 0");
         if (input_ == "transformer") encoder(weights, width, blocks);
@@ -318,10 +328,15 @@ class Policy {
             action = mlp(head_, encode(obs, scaled, age));
         } else {
             Floats x = obs;
-            if (input_ == "augmented") {
+            if (input_ != "observation") {
                 x.insert(x.end(), scaled.begin(), scaled.end());
                 x.resize(obs_size + max_age * action_size);
                 x.push_back(static_cast<float>(age) / static_cast<float>(max_age));
+            }
+            if (input_ == "forecast") {
+                Floats now = age > 0 ? mlp(forecast_, x, norms_) : Floats(obs_size);
+                for (std::size_t j = 0; j < obs_size; ++j) now[j] += obs[j];
+                x.insert(x.begin(), now.begin(), now.end());
             }
             action = mlp(head_, x);
         }
@@ -333,7 +348,8 @@ class Policy {
    private:
     std::string input_;
     Floats low_, high_, position_;
-    Mlp head_, current_;
+    Mlp head_, current_, forecast_;
+    std::vector<Norm> norms_;  // of the forecast
     Layer of_obs_, of_action_, join_obs_, join_action_;
     Norm norm_in_, norm_out_;
     std::vector<Block> blocks_;
@@ -351,9 +367,14 @@ class Policy {
         return {inputs, outputs, weights.take(name + ".w", {inputs, outputs}), weights.take(name + ".b", {outputs})};
     }
 
-    Mlp network(const Weights& weights, const std::string& name, std::size_t inputs, const Json& hidden) const {
+    static Norm norm(const Weights& weights, const std::string& name, std::size_t width) {
+        return {weights.take(name + ".scale", {width}), weights.take(name + ".shift", {width})};
+    }
+
+    static Mlp network(const Weights& weights, const std::string& name, std::size_t inputs, const Json& hidden,
+                       std::size_t outputs) {
         std::vector<std::size_t> sizes = hidden.integers(1e6);
-        sizes.push_back(action_size);
+        sizes.push_back(outputs);
         Mlp layers;
         for (std::size_t i = 0; i < sizes.size(); ++i) {
             layers.push_back(layer(weights, name + "." + std::to_string(i), inputs, sizes[i]));
@@ -363,9 +384,6 @@ class Policy {
     }
 
     void encoder(const Weights& weights, std::size_t width, std::size_t blocks) {
-        auto norm = [&](const std::string& name) {
-            return Norm{weights.take(name + ".scale", {width}), weights.take(name + ".shift", {width})};
-        };
         of_obs_ = layer(weights, "encoder.obs", obs_size, width);
         of_action_ = layer(weights, "encoder.action", action_size, width);
         const Layer join = layer(weights, "encoder.join", 2 * width, width);  // applied to both embeddings side by side
@@ -373,8 +391,8 @@ class Policy {
         join_obs_ = {width, width, Floats(join.w.begin(), middle), join.b};
         join_action_ = {width, width, Floats(middle, join.w.end()), Floats(width)};
         position_ = weights.take("encoder.position", {max_age, width});
-        norm_in_ = norm("encoder.norm_in");
-        norm_out_ = norm("encoder.norm_out");
+        norm_in_ = norm(weights, "encoder.norm_in", width);
+        norm_out_ = norm(weights, "encoder.norm_out", width);
         for (std::size_t i = 0; i < blocks; ++i) {
             const std::string name = "encoder.blocks." + std::to_string(i);
             const Layer qkv = layer(weights, name + ".qkv", width, 3 * width);
@@ -394,7 +412,7 @@ class Policy {
                     (r < width ? attend.w[r * width + j] : attend.b[j]) = static_cast<float>(asked / std::sqrt(double(width)));
                     (r < width ? value.w[r * width + j] : value.b[j]) = static_cast<float>(given);
                 }
-            blocks_.push_back({norm(name + ".norm1"), norm(name + ".norm2"), attend, value,
+            blocks_.push_back({norm(weights, name + ".norm1", width), norm(weights, name + ".norm2", width), attend, value,
                                layer(weights, name + ".mlp.0", width, width), layer(weights, name + ".mlp.1", width, width)});
         }
     }

@@ -14,7 +14,7 @@ from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.core import networks
 from delayrl.core import replay as ring
-from delayrl.core.forecast import as_mlp, follow_changes, forecast_loss, forecasting
+from delayrl.core.forecast import follow_changes, forecast_loss, forecasting, in_task_units
 from delayrl.core.objectives import soft_value
 from delayrl.core.sequence import sequence
 from delayrl.core.types import Spec
@@ -153,23 +153,33 @@ def away_from_start(spec: Spec) -> networks.Params:
     return jax.tree.unflatten(form, [x + jax.random.uniform(k, x.shape) for x, k in zip(leaves, keys, strict=True)])
 
 
+def views_of(rng: np.random.Generator, shape: tuple[int, ...]) -> jax.Array:
+    """Random x_t of a delay of 3, with age 0 and 3 in turn along the last axis."""
+    x = rng.normal(size=(*shape, OBS + 3 * ACT + 1))
+    x[..., -1] = np.arange(shape[-1]) % 2
+    return jnp.asarray(x, jnp.float32)
+
+
 def test_a_forecast_by_hand(rng: np.random.Generator) -> None:
-    """The policy reads the observation plus its forecast change, beside x_t; exported, both are one MLP."""
+    """The policy reads the observation plus its forecast change, at age 0 the observation itself, and then x_t."""
     actor = away_from_start(Spec(OBS, ACT, 3))
-    x = jnp.asarray(rng.normal(size=(6, OBS + 3 * ACT + 1)), jnp.float32)
+    x = views_of(rng, (6,))
     now = x[:, :OBS] + actor["deviation"] * networks.mlp(actor["forecast"], x)
+    now = jnp.where(jnp.arange(6)[:, None] % 2 == 0, x[:, :OBS], now)
     expected = networks.mlp(actor["policy"], jnp.concatenate([now, x], 1))
-    np.testing.assert_allclose(forecasting(actor, x), expected, rtol=1e-5)
-    np.testing.assert_allclose(networks.mlp(as_mlp(actor), x), expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(forecasting(actor, x), expected, rtol=1e-5, atol=1e-5)
+    change = np.asarray(networks.mlp(in_task_units(actor), x))
+    np.testing.assert_allclose(change[1::2], (now - x[:, :OBS])[1::2], rtol=1e-4, atol=1e-4)
 
 
 def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator) -> None:
     """Its error is in deviations, which follow the changes; the values of actions do not move it."""
     actor = away_from_start(Spec(OBS, ACT, 3))
-    x = jnp.asarray(rng.normal(size=(2, 5, OBS + 3 * ACT + 1)), jnp.float32)
-    state = jnp.asarray(rng.normal(size=(2, 5, OBS)), jnp.float32)
+    x = views_of(rng, (2, 6))
+    state = jnp.asarray(rng.normal(size=(2, 6, OBS)), jnp.float32)
     change = np.asarray(state - x[..., :OBS])
     error = np.asarray(networks.mlp(actor["forecast"], x)) - change / np.asarray(actor["deviation"])
+    error[:, ::2] = 0  # nothing is forecast at age 0
     np.testing.assert_allclose(forecast_loss(actor, x, state), (error**2).mean(), rtol=1e-5)
     learned = jax.grad(forecast_loss)(actor, x, state)
     valued = jax.grad(lambda actor: (forecasting(actor, x) ** 2).mean())(actor)

@@ -23,7 +23,8 @@ AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
 AGENTS["any-age, forecast"] = replace(TINY["any-age"], encoder="forecast")
 AGENTS["any-age, transformer"] = replace(TINY["any-age"], encoder="transformer", encoder_width=8)
-AGENTS |= {f"{name}, normalised": NormalisedObservations(TINY[name]) for name in ("bpql", "vdpo")}
+for name in ("bpql", "vdpo", "any-age, forecast"):
+    AGENTS[f"{name}, normalised"] = NormalisedObservations(AGENTS[name])
 DELAY = 4
 OBS, LOW, HIGH = 10, np.array([-0.4, -2.0], np.float32), np.array([0.4, 3.0], np.float32)
 """Reacher's sizes; a range of actions that is neither symmetric nor the same for all."""

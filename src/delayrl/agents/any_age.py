@@ -25,7 +25,7 @@ from delayrl.agents.base import Agent, Deterministic, Phase, Schedule, descend
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
-from delayrl.core.forecast import as_mlp, follow_changes, forecast_init, forecast_loss, forecasting
+from delayrl.core.forecast import follow_changes, forecast_init, forecast_loss, forecasting, in_task_units
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import annealed, gaussian_kl, masked_mean, soft_value
 from delayrl.core.sequence import sequence, sequence_init, tokens
@@ -98,7 +98,7 @@ class AnyAge:
     def deterministic(self, state: State) -> Deterministic:
         """Return the actor."""
         if "forecast" in state.actor:
-            return Deterministic("augmented", as_mlp(state.actor))
+            return Deterministic("augmented", state.actor["policy"], forecast=in_task_units(state.actor))
         if isinstance(state.actor, dict):
             return Deterministic("augmented", state.actor["head"], state.actor["encoder"], state.actor["current"])
         return self.bpql.deterministic(state)

@@ -17,16 +17,16 @@ def forecast_init(key: Key, spec: Spec, hidden: tuple[int, ...], outputs: int) -
     forecast_key, policy_key = jax.random.split(key)
     size, inputs = spec.obs_size, input_size(spec, "augmented")
     return {
-        "forecast": mlp_init(forecast_key, (inputs, *hidden, size)),
+        "forecast": mlp_init(forecast_key, (inputs, *hidden, size), norm="layer"),
         "deviation": jnp.ones(size),
         "policy": mlp_init(policy_key, (size + inputs, *hidden, outputs)),
     }
 
 
 def forecast(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch obs"]:
-    """Return the forecast of s_t: the observation in x_t plus its forecast change."""
+    """Return the forecast of s_t: the observation in x_t plus its forecast change, which is 0 at age 0."""
     change = params["deviation"] * mlp(params["forecast"], x)
-    return x[..., : change.shape[-1]] + change
+    return x[..., : change.shape[-1]] + jnp.where(_late(x), change, 0)
 
 
 def forecasting(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
@@ -38,7 +38,7 @@ def forecasting(params: Params, x: Float[Array, "*batch input"]) -> Float[Array,
 def forecast_loss(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Array:
     """Return the mean squared error of the change from the observation in x_t to s_t, in deviations."""
     change = _change(x, state) / jax.lax.stop_gradient(params["deviation"])
-    return ((mlp(params["forecast"], x) - change) ** 2).mean()
+    return (jnp.where(_late(x), mlp(params["forecast"], x) - change, 0) ** 2).mean()
 
 
 def follow_changes(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Params:
@@ -48,23 +48,17 @@ def follow_changes(params: Params, x: Float[Array, "*batch input"], state: Float
     return params | {"deviation": jnp.sqrt(square + 1e-8)}
 
 
+def _late(x: Array) -> Array:
+    """Tell whether the age, which comes last in x_t, is above 0."""
+    return x[..., -1:] > 0
+
+
 def _change(x: Array, state: Array) -> Array:
     """Return s_t less the observation in x_t, which comes first in it."""
     return state - x[..., : state.shape[-1]]
 
 
-def as_mlp(params: Params) -> Params:
-    """Return one MLP that is the same function: x passes the forecast's ReLUs as its positive and its negative part."""
-    first, *middle, last = params["forecast"]
-    entry, *rest = params["policy"]
-    inputs, size = len(first["w"]), len(params["deviation"])
-    same, nothing = jnp.eye(inputs), jnp.zeros(2 * inputs)
-    layers = [{"w": jnp.concatenate([first["w"], same, -same], 1), "b": jnp.concatenate([first["b"], nothing])}]
-    for layer in middle:
-        w = jax.scipy.linalg.block_diag(layer["w"], jnp.eye(2 * inputs))
-        layers.append({"w": w, "b": jnp.concatenate([layer["b"], nothing])})
-    on_forecast, on_x = jnp.split(entry["w"], [size])
-    on_x = on_x.at[:size].add(on_forecast)  # the forecast is the observation plus its change
-    on_change = params["deviation"][:, None] * on_forecast
-    w = jnp.concatenate([last["w"] @ on_change, on_x, -on_x])
-    return [*layers, {"w": w, "b": last["b"] @ on_change + entry["b"]}, *rest]
+def in_task_units(params: Params) -> Params:
+    """Return the MLP of the change with its deviations in the last layer."""
+    *layers, last = params["forecast"]
+    return [*layers, {name: part * params["deviation"] for name, part in last.items()}]

@@ -66,15 +66,18 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
         return tuple(layer["b"].shape[0] for layer in mlp[:-1])
 
     kind = "augmented" if parts.sees == "augmented" and spec.delay else "observation"
-    tree, sizes = {"head": mean(parts.head)}, {}
+    tree, sizes = {"head": mean(parts.head)}, dict[str, Any]()
     if parts.current is not None:
         tree["current"] = mean(parts.current)
+    if parts.forecast is not None:
+        kind, tree["forecast"] = "forecast", parts.forecast
     if parts.encoder is not None:
         kind, tree["encoder"] = "transformer", parts.encoder
         sizes = {"width": parts.encoder["position"].shape[1], "blocks": len(parts.encoder["blocks"])}
     low, high = tuple(policy.low.tolist()), tuple(policy.high.tolist())
-    current = None if parts.current is None else hidden(parts.current)
-    network = Network(spec.obs_size, size, spec.delay, low, high, kind, hidden(parts.head), current, **sizes)
+    current, forecast = (None if part is None else hidden(part) for part in (parts.current, parts.forecast))
+    sizes |= {"current": current, "forecast": forecast}
+    network = Network(spec.obs_size, size, spec.delay, low, high, kind, hidden(parts.head), **sizes)
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in flatten_tree(tree).items()}
     network.check(arrays)
     return network, arrays

@@ -22,8 +22,10 @@ def jax_policy(network: Network, arrays: Arrays) -> Act:
         scaled = 2 * (actions - low) / (high - low) - 1
         scaled = jnp.where((jnp.arange(network.max_age) < age)[:, None], scaled, 0)
         x = obs
-        if network.input == "augmented":
+        if network.input in ("augmented", "forecast"):
             x = jnp.concatenate([obs, scaled.reshape(-1), (age / network.max_age)[None]])
+        if network.input == "forecast":
+            x = jnp.concatenate([obs + jnp.where(age > 0, networks.mlp(params["forecast"], x), 0), x])
         if network.input == "transformer":
             x = transformer(params["encoder"], obs, scaled)[age - 1]
         raw = networks.mlp(params["head"], x)

@@ -13,7 +13,7 @@ from delayrl.errors import DelayRLError
 Arrays = Mapping[str, NDArray[np.float32]]
 Act = Callable[[NDArray[np.float32], NDArray[np.float32], int], NDArray[np.float32]]
 """Maps obs [S], actions [Δ, A] and the age to an action [A]; actions are in the task's units."""
-INPUTS = ("observation", "augmented", "transformer")
+INPUTS = ("observation", "augmented", "forecast", "transformer")
 LONGEST_AGE, LARGEST_HISTORY = 10_000, 10_000_000
 """Bounds of the steps, and of the numbers, in a policy's history: a small file must not ask for much memory."""
 
@@ -23,8 +23,10 @@ class Network:
     """Describe a deterministic policy: tanh of an MLP with ReLU, scaled from [-1, 1] to low .. high.
 
     `input` is what the MLP `head` reads: "observation" [S]; "augmented" [S + Δ·A + 1], which is the observation, the
-    scaled actions since (zeros after the first `age`) and age / Δ; or "transformer" [width], the encoder's output at
-    the age. A second MLP, `current`, may act at age 0. It reads the observation.
+    scaled actions since (zeros after the first `age`) and age / Δ; "forecast" [2 S + Δ·A + 1], the same after a
+    forecast of the current state, which is the observation plus the output of the MLP `forecast` on the same (nothing
+    at age 0), with a layer norm before each ReLU; or "transformer" [width], the encoder's output at the age. A last
+    MLP, `current`, may act at age 0. It reads the observation.
     """
 
     obs_size: int  # S
@@ -37,6 +39,7 @@ class Network:
     current: tuple[int, ...] | None = None  # widths of its hidden layers; None if there is no such MLP
     width: int = 0  # sizes of the encoder; 0 if there is none
     blocks: int = 0
+    forecast: tuple[int, ...] | None = None  # widths of its hidden layers; None if there is no such MLP
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the names and shapes of all arrays. Weights such as `head.0.w` are [inputs, outputs]."""
@@ -45,18 +48,22 @@ class Network:
         def layer(name: str, inputs: int, outputs: int) -> None:
             shapes[f"{name}.w"], shapes[f"{name}.b"] = (inputs, outputs), (outputs,)
 
-        def mlp(name: str, inputs: int, hidden: tuple[int, ...]) -> None:
-            for i, (rows, columns) in enumerate(itertools.pairwise((inputs, *hidden, self.action_size))):
+        def mlp(name: str, inputs: int, hidden: tuple[int, ...], outputs: int = self.action_size) -> None:
+            for i, (rows, columns) in enumerate(itertools.pairwise((inputs, *hidden, outputs))):
                 layer(f"{name}.{i}", rows, columns)
 
-        def norm(name: str) -> None:
-            shapes[f"{name}.scale"] = shapes[f"{name}.shift"] = (self.width,)
+        def norm(name: str, width: int = self.width) -> None:
+            shapes[f"{name}.scale"] = shapes[f"{name}.shift"] = (width,)
 
         augmented = self.obs_size + self.max_age * self.action_size + 1
         sizes = {"observation": self.obs_size, "augmented": augmented, "transformer": self.width}
-        mlp("head", sizes[self.input], self.hidden)
+        mlp("head", sizes.get(self.input, self.obs_size + augmented), self.hidden)
         if self.current is not None:
             mlp("current", self.obs_size, self.current)
+        if self.forecast is not None:
+            mlp("forecast", augmented, self.forecast, self.obs_size)
+            for i, width in enumerate(self.forecast):
+                norm(f"forecast.{i}.norm", width)
         if self.input == "transformer":
             layer("encoder.obs", self.obs_size, self.width)
             layer("encoder.action", self.action_size, self.width)
@@ -124,12 +131,14 @@ def parse(document: Any) -> Network:
         raise DelayRLError(f"its policy's max_age is above {LONGEST_AGE:,}, or its history too large")
     kind = document.get("input")
     if kind not in INPUTS or (sizes["max_age"] == 0 and kind != "observation"):
-        raise DelayRLError(f"its policy's input must be one of {', '.join(INPUTS)}; the last two need an age")
+        raise DelayRLError(f"its policy's input must be one of {', '.join(INPUTS)}; all but the first need an age")
     if kind == "transformer" and document.get("current") is None:
         raise DelayRLError("its policy's input is transformer, which has no output at age 0: it needs a current")
     hidden = widths("hidden")
     current = None if document.get("current") is None else widths("current")
+    forecast = widths("forecast") if kind == "forecast" else None
     least = int(kind == "transformer")
     width = integer("width", least, document.get("width"))
     blocks = integer("blocks", least, document.get("blocks"), 1000)
-    return Network(**sizes, low=low, high=high, input=kind, hidden=hidden, current=current, width=width, blocks=blocks)
+    counts = {**sizes, "width": width, "blocks": blocks}
+    return Network(**counts, low=low, high=high, input=kind, hidden=hidden, current=current, forecast=forecast)

@@ -12,6 +12,7 @@ Of six square products for each token and block, four remain. Only positions 0..
 block only the last of them, because no other is read.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,7 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
     gain, half = 2 / (high - low), (high - low) / 2
     current = layers(arrays, "current")
     encoder, head = fold(network, arrays) if network.input == "transformer" else (None, layers(arrays, "head"))
+    forecast, norms = layers(arrays, "forecast"), layer_norms(arrays, "forecast")
 
     def act(obs: Array, actions: Array, age: int) -> Array:
         if age == 0 and current:
@@ -65,6 +67,8 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
                 x[: len(obs)] = obs
                 x[len(obs) : len(obs) + scaled.size] = scaled.ravel()
                 x[-1] = age / network.max_age
+                if forecast:
+                    x = np.concatenate([obs + _mlp(forecast, x, norms) if age else obs, x])
         return low + (np.tanh(_mlp(head, x)) + 1) * half
 
     return act
@@ -72,8 +76,14 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
 
 def layers(arrays: Arrays, name: str) -> list[Layer]:
     """Return the (w, b) of each layer of an MLP; an empty list if there is no such MLP."""
-    count = sum(key.startswith(f"{name}.") for key in arrays) // 2
+    count = sum(key.startswith(f"{name}.") and key.endswith(".b") for key in arrays)
     return [(arrays[f"{name}.{i}.w"], arrays[f"{name}.{i}.b"]) for i in range(count)]
+
+
+def layer_norms(arrays: Arrays, name: str) -> list[Layer]:
+    """Return the scale and shift of the layer norm of each hidden layer of an MLP that has them."""
+    count = sum(key.startswith(f"{name}.") and key.endswith(".norm.scale") for key in arrays)
+    return [(arrays[f"{name}.{i}.norm.scale"], arrays[f"{name}.{i}.norm.shift"]) for i in range(count)]
 
 
 def fold(network: Network, arrays: Arrays) -> tuple[Encoder, list[Layer]]:
@@ -111,9 +121,12 @@ def fold(network: Network, arrays: Arrays) -> tuple[Encoder, list[Layer]]:
     return Encoder(obs, action, position, norm_in, blocks), head
 
 
-def _mlp(layers: list[Layer], x: Array) -> Array:
-    for w, b in layers[:-1]:
-        x = np.maximum(x @ w + b, 0)
+def _mlp(layers: list[Layer], x: Array, norms: Sequence[Layer] = ()) -> Array:
+    for i, (w, b) in enumerate(layers[:-1]):
+        x = x @ w + b
+        if norms:
+            x = _normalised(x) * norms[i][0] + norms[i][1]
+        x = np.maximum(x, 0)
     w, b = layers[-1]
     return x @ w + b
 

@@ -6,14 +6,14 @@ without control flow.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.backends.network import Act, Arrays, Network
-from delayrl.deploy.backends.numpy_policy import Encoder, Layer, fold, layers
+from delayrl.deploy.backends.numpy_policy import Encoder, Layer, fold, layer_norms, layers
 from delayrl.errors import DelayRLError, first_line
 
 OPSET, IR = 17, 8
@@ -48,11 +48,16 @@ class Graph:
         """Add x w + b; return its name."""
         return self("Add", self("MatMul", x, self.constant(layer[0])), self.constant(layer[1]))
 
-    def mlp(self, layers: list[Layer], x: str) -> str:
-        """Add an MLP with ReLU between its layers; return its name."""
-        for layer in layers[:-1]:
-            x = self("Relu", self.linear(layer, x))
+    def mlp(self, layers: list[Layer], x: str, norms: Sequence[Layer] = ()) -> str:
+        """Add an MLP with ReLU between its layers, and layer norms before them if there are any; return its name."""
+        for i, layer in enumerate(layers[:-1]):
+            x = self.linear(layer, x)
+            x = self("Relu", self.norm(x, *norms[i]) if norms else x)
         return self.linear(layers[-1], x)
+
+    def norm(self, x: str, scale: ArrayLike, shift: ArrayLike) -> str:
+        """Add a layer norm; return its name."""
+        return self("LayerNormalization", x, self.constant(scale), self.constant(shift), axis=-1, epsilon=1e-5)
 
 
 def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) -> bytes:
@@ -70,13 +75,17 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
     else:
         shifted = graph("Mul", graph("Sub", "actions", graph.constant(low)), graph.constant(2 / (high - low)))
         scaled = graph("Sub", shifted, graph.constant(1))
-        if network.input == "augmented":
-            raw = graph.mlp(layers(arrays, "head"), _augmented(graph, network, row, scaled))
-        else:
-            encoder, head = fold(network, arrays)
-            raw = graph.mlp(head, _encoded(graph, encoder, row, scaled))
-    if current := layers(arrays, "current"):
         delayed = graph("Greater", "age", graph.constant(0, np.int64))
+        if network.input == "transformer":
+            encoder, head = fold(network, arrays)
+            x = _encoded(graph, encoder, row, scaled)
+        else:
+            head, x = layers(arrays, "head"), _augmented(graph, network, row, scaled)
+        if network.input == "forecast":
+            change = graph.mlp(layers(arrays, "forecast"), x, layer_norms(arrays, "forecast"))
+            x = graph("Concat", graph("Where", delayed, graph("Add", row, change), row), x, axis=1)
+        raw = graph.mlp(head, x)
+    if current := layers(arrays, "current"):
         raw = graph("Where", delayed, raw, graph.mlp(current, row))
     unit = graph("Reshape", graph("Tanh", raw), graph.constant([network.action_size], np.int64))
     gained = graph("Mul", graph("Add", unit, graph.constant(1)), graph.constant((high - low) / 2))
@@ -159,7 +168,7 @@ def _encoded(graph: Graph, encoder: Encoder, row: str, scaled: str) -> str:
     age = graph("Reshape", graph("Max", "age", graph.constant(1, np.int64)), graph.constant([1], np.int64))
 
     def norm(x: str, scale: ArrayLike = ones, shift: ArrayLike = zeros) -> str:
-        return graph("LayerNormalization", x, graph.constant(scale), graph.constant(shift), axis=-1, epsilon=1e-5)
+        return graph.norm(x, scale, shift)
 
     tokens = graph("MatMul", graph("Slice", scaled, start, age), graph.constant(encoder.action))
     tokens = graph("Add", tokens, graph("Slice", graph.constant(encoder.position), start, age))
