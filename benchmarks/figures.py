@@ -197,7 +197,7 @@ def costs(env: str, delays: tuple[int, ...]) -> str:
     titles += [f"GFLOP, Δ = {delay}" for delay in delays]
     lines = ["| " + " | ".join(titles) + " |", "| --- " * len(titles) + "|"]
     specs = {delay: spec_of(make(env, delay, rescale=True)) for delay in (0, *delays)}
-    variants = [*((agent, {}) for agent in AGENTS if agent != "random"), ("any-age", {"encoder": "forecast"})]
+    variants = [*((agent, {}) for agent in AGENTS if agent != "random"), ("any-age", {"encoder": "mlp"})]
     for agent, overrides in variants:
         own = [0] * len(delays) if agent == "sac" else delays
         setups = [resolve(agent, env, delay, "matched", "corrected", overrides) for delay in own]

@@ -288,11 +288,9 @@ class Policy {
         if (input_ != "observation" && max_age == 0) refuse("the policy's input needs an age");
         if (input_ == "augmented")
             read = augmented;
-        else if (input_ == "forecast")
-            read += augmented;
         else if (input_ == "transformer")
             read = width;
-        else if (input_ != "observation")
+        else if (input_ != "observation" && input_ != "forecast")
             refuse("the policy reads an input that this program does not support");
         head_ = network(weights, "head", read, described.at("hidden"), action_size);
         if (described.at("current").kind == Json::list)
@@ -328,15 +326,14 @@ class Policy {
             action = mlp(head_, encode(obs, scaled, age));
         } else {
             Floats x = obs;
-            if (input_ != "observation") {
+            if (input_ == "augmented" || (input_ == "forecast" && age > 0)) {
                 x.insert(x.end(), scaled.begin(), scaled.end());
                 x.resize(obs_size + max_age * action_size);
                 x.push_back(static_cast<float>(age) / static_cast<float>(max_age));
             }
-            if (input_ == "forecast") {
-                Floats now = age > 0 ? mlp(forecast_, x, norms_) : Floats(obs_size);
-                for (std::size_t j = 0; j < obs_size; ++j) now[j] += obs[j];
-                x.insert(x.begin(), now.begin(), now.end());
+            if (input_ == "forecast" && age > 0) {
+                x = mlp(forecast_, x, norms_);
+                for (std::size_t j = 0; j < obs_size; ++j) x[j] += obs[j];
             }
             action = mlp(head_, x);
         }

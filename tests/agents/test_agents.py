@@ -21,7 +21,8 @@ HONEST = {name: TINY[name] for name in DELAYED if name not in PRIVILEGED} | {
     "vdpo, behaviour delayed": dataclasses.replace(TINY["vdpo"], behaviour="delayed"),
     "ad-sac, behaviour augmented": dataclasses.replace(TINY["ad-sac"], behaviour="augmented"),
     "bpql, normalised observations": NormalisedObservations(TINY["bpql"]),
-    "any-age, forecast": dataclasses.replace(TINY["any-age"], encoder="forecast"),
+    "any-age, mlp": dataclasses.replace(TINY["any-age"], encoder="mlp"),
+    "any-age, pulled": dataclasses.replace(TINY["any-age"], pull_weight=1.0),
     "any-age, transformer": dataclasses.replace(TINY["any-age"], encoder="transformer", belief_weight=1.0),
     "ad-sac, auxiliary delay 1": dataclasses.replace(TINY["ad-sac"], auxiliary_delay=1),
 }

@@ -21,7 +21,7 @@ from delayrl.core.types import Spec
 from delayrl.core.views import network_input
 from delayrl.errors import DelayRLError
 
-AGENT = TINY["any-age"]
+AGENT = replace(TINY["any-age"], encoder="mlp", pull_weight=1.0)
 
 
 def test_without_a_second_age_it_is_bpql() -> None:
@@ -55,6 +55,17 @@ def test_younger_views() -> None:
         assert len(counts) == age + 1  # none older than what was shown
         expected = len(drawn) / (age + 1)
         assert ((counts - expected) ** 2 / expected).sum() < age + 6 * np.sqrt(2 * max(age, 1))
+
+
+def test_ages_in_turn_without_a_pull(rng: np.random.Generator) -> None:
+    """One view of each sample, half of them younger; a pull compares both views of each."""
+    own, younger = jnp.asarray(rng.normal(size=(2, 6, 4)))
+    mixed = replace(AGENT, pull_weight=0.0).views(own, younger)
+    np.testing.assert_array_equal(mixed[0, ::2], own[::2])
+    np.testing.assert_array_equal(mixed[0, 1::2], younger[1::2])
+    assert len(mixed) == 1
+    np.testing.assert_array_equal(AGENT.views(own, younger), jnp.stack([own, younger]))
+    np.testing.assert_array_equal(AGENT.views(own, None), own[None])
 
 
 @pytest.mark.parametrize("distance", ["moments", "kl"])
@@ -161,13 +172,12 @@ def views_of(rng: np.random.Generator, shape: tuple[int, ...]) -> jax.Array:
 
 
 def test_a_forecast_by_hand(rng: np.random.Generator) -> None:
-    """The policy reads the observation plus its forecast change, at age 0 the observation itself, and then x_t."""
+    """The policy reads the observation plus its forecast change; at age 0, the observation itself."""
     actor = away_from_start(Spec(OBS, ACT, 3))
     x = views_of(rng, (6,))
     now = x[:, :OBS] + actor["deviation"] * networks.mlp(actor["forecast"], x)
     now = jnp.where(jnp.arange(6)[:, None] % 2 == 0, x[:, :OBS], now)
-    expected = networks.mlp(actor["policy"], jnp.concatenate([now, x], 1))
-    np.testing.assert_allclose(forecasting(actor, x), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(forecasting(actor, x), networks.mlp(actor["policy"], now), rtol=1e-5, atol=1e-5)
     change = np.asarray(networks.mlp(in_task_units(actor), x))
     np.testing.assert_allclose(change[1::2], (now - x[:, :OBS])[1::2], rtol=1e-4, atol=1e-4)
 

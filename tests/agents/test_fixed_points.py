@@ -271,7 +271,7 @@ def test_any_age_ends_where_its_pull_leaves_it(weight: float, distance: Any) -> 
     assert narrower == pytest.approx(0.0 if weight == 0 else {"moments": 0.364, "kl": 0.246}[distance], abs=0.01)
     bpql = AGENTS["bpql"]
     constant = {"pull_hold": 1.0, "pull_end": 1.0, "run_steps": 10**6, "second_age": "zero"}
-    agent = AnyAge(bpql, pull_weight=weight, pull=distance, **constant)
+    agent = AnyAge(bpql, pull_weight=weight, pull=distance, encoder="mlp", **constant)
     state = agent.init(Spec(STATES, 1, 1), jax.random.key(1))
     for rate, updates in ((1e-2, 1200), (1e-3, 300)):
         agent = replace(agent, bpql=with_options(bpql, actor_learning_rate=rate, critic_learning_rate=rate))

@@ -9,10 +9,10 @@ from delayrl.run.configuration import values_of
 ANY_AGE = {
     "second_age": "random",
     "pull": "moments",
-    "pull_weight": 1.0,
+    "pull_weight": 0.0,
     "pull_hold": 0.25,
     "pull_end": 0.75,
-    "encoder": "mlp",
+    "encoder": "forecast",
     "encoder_width": 64,
     "encoder_layers": 2,
     "belief_weight": 0.0,

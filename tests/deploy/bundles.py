@@ -21,9 +21,9 @@ from delayrl.run.folder import RunFolder
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
-AGENTS["any-age, forecast"] = replace(TINY["any-age"], encoder="forecast")
+AGENTS["any-age, mlp"] = replace(TINY["any-age"], encoder="mlp")
 AGENTS["any-age, transformer"] = replace(TINY["any-age"], encoder="transformer", encoder_width=8)
-for name in ("bpql", "vdpo", "any-age, forecast"):
+for name in ("bpql", "vdpo", "any-age"):
     AGENTS[f"{name}, normalised"] = NormalisedObservations(AGENTS[name])
 DELAY = 4
 OBS, LOW, HIGH = 10, np.array([-0.4, -2.0], np.float32), np.array([0.4, 3.0], np.float32)

@@ -45,10 +45,10 @@ class AnyAge:
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, critic_norm="layer"))
     second_age: Annotated[SecondAge, "the younger age that the actor learns at too: random in 0..d, or 0"] = "random"
     pull: Annotated[Pull, "distance of the two policies: that of lifting's moments, or KL(older‖younger)"] = "moments"
-    pull_weight: Annotated[float, "initial weight of the pull towards the younger age", (0.0, 1e6)] = 1.0
+    pull_weight: Annotated[float, "initial weight of the pull towards the younger age", (0.0, 1e6)] = 0.0
     pull_hold: Annotated[float, "part of the run in which the weight stays constant", (0.0, 1.0)] = 0.25
     pull_end: Annotated[float, "part of the run after which the weight, falling linearly, is 0", (0.0, 1.0)] = 0.75
-    encoder: Annotated[Encoder, "how the actor reads x_t: flat, flat with a forecast of s_t, or as a sequence"] = "mlp"
+    encoder: Annotated[Encoder, "how the actor reads x_t: by a forecast of s_t, flat, or as a sequence"] = "forecast"
     encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
     encoder_layers: Annotated[int, "transformer blocks"] = 2
     belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
@@ -137,7 +137,7 @@ class AnyAge:
         key: Key,
     ) -> State:
         """Take one gradient step on the actor: as much for each age, the pull of the older one, its encoder's loss."""
-        x = jnp.stack([actor_input] if younger is None else [actor_input, younger])
+        x = self.views(actor_input, younger)
         states, temperature = jnp.stack([critic_input] * len(x)), jnp.exp(state.log_temperature)
 
         def loss(actor: Params) -> tuple[Array, None]:
@@ -145,7 +145,7 @@ class AnyAge:
             action, log_prob = networks.sample(policy, key)
             q = networks.twin(state.critic, states, action)
             total = -soft_value(q, log_prob, temperature).mean()
-            if younger is not None:
+            if len(x) > 1:
                 total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.encoder == "forecast":
                 total += forecast_loss(actor, x, states)
@@ -158,6 +158,14 @@ class AnyAge:
         if self.encoder == "forecast":
             actor = follow_changes(actor, x, states)
         return state._replace(actor=actor, actor_opt_state=opt_state)
+
+    def views(self, own: Float[Array, "batch input"], younger: Array | None) -> Float[Array, "ages batch input"]:
+        """Return what the actor learns at: one view of each sample, in turn of each age; with a pull, both."""
+        if younger is None:
+            return own[None]
+        if self.pull_weight:
+            return jnp.stack([own, younger])
+        return jnp.where(jnp.arange(len(own))[:, None] % 2 == 0, own, younger)[None]
 
     def distance(self, older: Gaussian, younger: Gaussian) -> Float[Array, ""]:
         """Return how far the older policy is from the younger one, which is held fixed."""

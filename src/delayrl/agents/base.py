@@ -35,9 +35,9 @@ class Deterministic(NamedTuple):
     """An agent's deterministic policy as plain networks, for callers that run it without the agent.
 
     The action is tanh of the first A outputs of `head`, an `mlp`. Its input is the shown observation, or x_t as
-    `network_input` returns it, with a `forecast` before it: the shown observation plus, if it is late, the output of
-    that `mlp` on x_t. Or it is, with an `encoder`, the output of that `transformer` on x_t at the shown age. At age 0
-    `current`, an `mlp` on the observation, acts instead if there is one.
+    `network_input` returns it, or, with a `forecast`, the shown observation plus, if it is late, the output of that
+    `mlp` on x_t, or, with an `encoder`, the output of that `transformer` on x_t at the shown age. At age 0 `current`,
+    an `mlp` on the observation, acts instead if there is one.
     """
 
     sees: Sees

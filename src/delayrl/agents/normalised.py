@@ -78,12 +78,12 @@ class NormalisedObservations:
         networks, moments = self.agent.deterministic(state.agent), state.moments
         current = None if networks.current is None else _folded(networks.current, moments)
         if networks.encoder is None:
+            networks = networks._replace(head=_folded(networks.head, moments), current=current)
             if networks.forecast is None:
-                return networks._replace(head=_folded(networks.head, moments), current=current)
+                return networks
             *layers, last = _folded(networks.forecast, moments)
             unscaled = {name: part * _deviation(moments) for name, part in last.items()}  # changes in the task's units
-            head = _folded(networks.head, moments, observations=2)  # the forecast, and the one in x_t
-            return networks._replace(head=head, current=current, forecast=[*layers, unscaled])
+            return networks._replace(forecast=[*layers, unscaled])
         encoder = networks.encoder | {"obs": _folded([networks.encoder["obs"]], moments)[0]}
         return networks._replace(encoder=encoder, current=current)
 
@@ -117,10 +117,9 @@ def _deviation(moments: Moments) -> Float[Array, " obs"]:
     return jnp.where(moments.number > 0, jnp.maximum(known, LEAST_DEVIATION), 1.0)
 
 
-def _folded(layers: Params, moments: Moments, observations: int = 1) -> Params:
+def _folded(layers: Params, moments: Moments) -> Params:
     """Return an `mlp` that takes observations as they are: the first rows of its first layer read them."""
     first, *rest = layers
-    mean, deviation = (jnp.tile(x, observations) for x in (moments.mean, _deviation(moments)))
-    rows = first["w"][: len(mean)] / deviation[:, None]
-    weights = jnp.concatenate([rows, first["w"][len(mean) :]])
-    return [first | {"w": weights, "b": first["b"] - mean @ rows}, *rest]
+    rows = first["w"][: len(moments.mean)] / _deviation(moments)[:, None]
+    weights = jnp.concatenate([rows, first["w"][len(moments.mean) :]])
+    return [first | {"w": weights, "b": first["b"] - moments.mean @ rows}, *rest]

@@ -1,4 +1,4 @@
-"""A policy network that reads x_t and a forecast of s_t: an MLP for the change since the observation, one to act."""
+"""A policy network that reads a forecast of s_t: an MLP on x_t for the change since the observation, and one to act."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ def forecast_init(key: Key, spec: Spec, hidden: tuple[int, ...], outputs: int) -
     return {
         "forecast": mlp_init(forecast_key, (inputs, *hidden, size), norm="layer"),
         "deviation": jnp.ones(size),
-        "policy": mlp_init(policy_key, (size + inputs, *hidden, outputs)),
+        "policy": mlp_init(policy_key, (size, *hidden, outputs)),
     }
 
 
@@ -30,9 +30,8 @@ def forecast(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*
 
 
 def forecasting(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
-    """Apply the policy's MLP to the forecast of s_t, which it cannot change, and x_t."""
-    now = forecast(params, x)
-    return mlp(params["policy"], jnp.concatenate([jax.lax.stop_gradient(now), x], -1))
+    """Apply the policy's MLP to the forecast of s_t, which it cannot change."""
+    return mlp(params["policy"], jax.lax.stop_gradient(forecast(params, x)))
 
 
 def forecast_loss(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Array:

@@ -25,7 +25,7 @@ def jax_policy(network: Network, arrays: Arrays) -> Act:
         if network.input in ("augmented", "forecast"):
             x = jnp.concatenate([obs, scaled.reshape(-1), (age / network.max_age)[None]])
         if network.input == "forecast":
-            x = jnp.concatenate([obs + jnp.where(age > 0, networks.mlp(params["forecast"], x), 0), x])
+            x = obs + jnp.where(age > 0, networks.mlp(params["forecast"], x), 0)
         if network.input == "transformer":
             x = transformer(params["encoder"], obs, scaled)[age - 1]
         raw = networks.mlp(params["head"], x)

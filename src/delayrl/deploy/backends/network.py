@@ -23,10 +23,10 @@ class Network:
     """Describe a deterministic policy: tanh of an MLP with ReLU, scaled from [-1, 1] to low .. high.
 
     `input` is what the MLP `head` reads: "observation" [S]; "augmented" [S + Δ·A + 1], which is the observation, the
-    scaled actions since (zeros after the first `age`) and age / Δ; "forecast" [2 S + Δ·A + 1], the same after a
-    forecast of the current state, which is the observation plus the output of the MLP `forecast` on the same (nothing
-    at age 0), with a layer norm before each ReLU; or "transformer" [width], the encoder's output at the age. A last
-    MLP, `current`, may act at age 0. It reads the observation.
+    scaled actions since (zeros after the first `age`) and age / Δ; "forecast" [S], the observation plus, above
+    age 0, the output of the MLP `forecast`, which reads the same and has a layer norm before each ReLU; or
+    "transformer" [width], the encoder's output at the age. A last MLP, `current`, may act at age 0. It reads the
+    observation.
     """
 
     obs_size: int  # S
@@ -56,8 +56,7 @@ class Network:
             shapes[f"{name}.scale"] = shapes[f"{name}.shift"] = (width,)
 
         augmented = self.obs_size + self.max_age * self.action_size + 1
-        sizes = {"observation": self.obs_size, "augmented": augmented, "transformer": self.width}
-        mlp("head", sizes.get(self.input, self.obs_size + augmented), self.hidden)
+        mlp("head", {"augmented": augmented, "transformer": self.width}.get(self.input, self.obs_size), self.hidden)
         if self.current is not None:
             mlp("current", self.obs_size, self.current)
         if self.forecast is not None:

@@ -58,7 +58,7 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
         if age == 0 and current:
             return low + (np.tanh(_mlp(current, obs)) + 1) * half
         x = obs
-        if network.input != "observation":
+        if network.input != "observation" and (age or not forecast):
             scaled = (actions[:age] - low) * gain - 1
             if encoder is not None:
                 x = _encode(encoder, obs, scaled)
@@ -68,7 +68,7 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
                 x[len(obs) : len(obs) + scaled.size] = scaled.ravel()
                 x[-1] = age / network.max_age
                 if forecast:
-                    x = np.concatenate([obs + _mlp(forecast, x, norms) if age else obs, x])
+                    x = obs + _mlp(forecast, x, norms)
         return low + (np.tanh(_mlp(head, x)) + 1) * half
 
     return act

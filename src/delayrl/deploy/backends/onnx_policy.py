@@ -83,7 +83,7 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
             head, x = layers(arrays, "head"), _augmented(graph, network, row, scaled)
         if network.input == "forecast":
             change = graph.mlp(layers(arrays, "forecast"), x, layer_norms(arrays, "forecast"))
-            x = graph("Concat", graph("Where", delayed, graph("Add", row, change), row), x, axis=1)
+            x = graph("Where", delayed, graph("Add", row, change), row)
         raw = graph.mlp(head, x)
     if current := layers(arrays, "current"):
         raw = graph("Where", delayed, raw, graph.mlp(current, row))
