@@ -328,7 +328,8 @@ def main() -> None:
         insert(root / "docs" / "benchmarks.md", "learning", text)
     if (rows := HERE / "results" / "any-age-ladder.sqlite").exists():
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", ladder.section(rows, images / "ladder.png"))
-    insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())
+    if forecast.OUT.exists():
+        insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())
     if list((HERE / "results" / "times").glob("*.jsonl")):
         text = times.section(HERE / "results" / "times", images / "times.png")
         insert(root / "docs" / "performance.md", "times", text)

@@ -1,12 +1,12 @@
-"""Any-age: BPQL whose actor is trained on several views of the same moment, the older pulled towards the younger.
+"""Any-age: BPQL whose actor acts on a forecast of the current state, one network for every age.
 
-Idea: BPQL's critic values actions in the true state s_t, whatever view chose them. For one and the same s_t the replay
-holds every younger view too: x^(j)_t = (s_{t-j}, a_{t-j}, …, a_{t-1}), j = 0..d. So one actor learns to act at its own
-age d and at a random younger age j from the same critic. π(x^(d)_t) is pulled towards π(x^(j)_t), with a weight that is
-annealed to nothing: what is easy to learn with a fresh observation climbs up to the old ones.
+Idea: BPQL's critic values actions in the true state s_t, whatever view chose them. A forecast of s_t from x_t learns
+from the states alone, and the policy acts on it. For one and the same s_t the replay holds every younger view too:
+x^(j)_t = (s_{t-j}, a_{t-j}, …, a_{t-1}), j = 0..d. So half of each batch is seen at a random younger age, and the same
+critic teaches every age. π(x^(d)_t) may be pulled towards π(x^(j)_t), with a weight that is annealed to nothing.
 
-Views: the actor sees x_t, at its own and at a younger age; the critics see s_t. Unprivileged: s_t and the observations
-in between are learned from once they have arrived.
+Views: the actor sees a forecast from x_t, at its own and at a younger age; the critics see s_t. Unprivileged: s_t and
+the observations in between are learned from once they have arrived.
 
 What it takes from whom stands in docs/algorithms/any-age.md.
 """
