@@ -91,8 +91,11 @@ def section() -> str:
         table.append(f"| {seed} | " + " | ".join(f"{means[seed, way]:,.0f}" for way in WAYS) + " |")
     mean = [np.mean([means[seed, way] for seed in seeds]) for way in WAYS]
     table.append("| mean | " + " | ".join(f"{value:,.0f}" for value in mean) + " |")
+    what = (
+        "The same policies with the true state in place of the forecast, which no plant can give, and without a delay:"
+    )
     about = f"{lines[0]['env']}, Δ = {lines[0]['delay']}, policies of {lines[0]['steps']:,} steps, {head['episodes']}"
-    return "\n".join(table) + f"\n\n{about} episodes each. Rows: `benchmarks/results/{OUT.name}`."
+    return f"{what}\n\n" + "\n".join(table) + f"\n\n{about} episodes each. Rows: `benchmarks/results/{OUT.name}`."
 
 
 if __name__ == "__main__":

@@ -294,7 +294,7 @@ def machine(rows: list[Row]) -> str:
         f"{words('cores')} x86 cores ({words('device')}), shared with other work: the load is the mean number "
         f"of processes that wanted a core. Python {words('python')}, jax {words('jax')}, "
         f"MuJoCo {words('mujoco')}, Gymnasium {words('gymnasium')}{peers and f'; peers: {peers}'}. "
-        f"Commit {commits(rows)}; {' to '.join(dates)}. "
+        f"Commit {commits(rows)}; {' to '.join(sorted({dates[0], dates[-1]}))}. "
         "Rows: `benchmarks/results/speed.jsonl`."
     )
 

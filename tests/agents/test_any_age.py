@@ -26,7 +26,7 @@ AGENT = replace(TINY["any-age"], encoder="mlp", pull_weight=1.0)
 
 def test_without_a_second_age_it_is_bpql() -> None:
     """Bit for bit, with BPQL's critics normed alike; with one, the critics' first update is still BPQL's."""
-    plain = replace(AGENT, second_age="none")
+    plain = replace(AGENT, second_age="none", pull_weight=0.0)
     assert same(trained(plain, 3)[0].agent, trained(AGENT.bpql, 3)[0].agent)
     assert not same(trained(AGENT, 3)[0].agent.actor, trained(AGENT.bpql, 3)[0].agent.actor)
 
@@ -115,6 +115,8 @@ def test_annealing_in_parts_of_the_run() -> None:
     assert [float(sudden.weight(jnp.int32(n))) for n in (499, 500)] == [2.0, 0.0]
     with pytest.raises(DelayRLError, match=r"pull_hold must be no later than pull_end, 0\.2; got 0\.3"):
         AnyAge(pull_hold=0.3, pull_end=0.2).for_run(Schedule())
+    with pytest.raises(DelayRLError, match="pull_weight needs a second_age"):
+        AnyAge(pull_weight=1.0, second_age="none").for_run(Schedule())
 
 
 def test_clock_is_the_environment_step() -> None:
@@ -200,14 +202,17 @@ def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator)
     np.testing.assert_allclose(follow_changes(actor, x, state)["deviation"], np.sqrt(square), rtol=1e-4)
 
 
-def test_a_forecast_is_learned_in_an_update() -> None:
-    """At both ages, or at its own alone, towards the true state."""
+@pytest.mark.parametrize("pulled", [True, False])
+def test_a_forecast_is_learned_in_an_update(pulled: bool) -> None:
+    """At both ages, at both in turn, or at its own alone, towards the true state."""
+    agent = replace(FORECASTING, pull_weight=float(pulled))
     state = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
     windows = random_windows(Spec(OBS, ACT, 3))
     older, now = FORECASTING.bpql._inputs(windows, 0)
     younger = FORECASTING.younger(windows, jax.random.key(2))
-    for second, views in ((younger, [older, younger]), (None, [older])):
-        moved = FORECASTING.improve_actor(windows, second, jnp.float32(0.0), state, older, now, jax.random.key(5))
+    in_turn = jnp.where(jnp.arange(len(older))[:, None] % 2 == 0, older, younger)
+    for second, views in ((younger, [older, younger] if pulled else [in_turn]), (None, [older])):
+        moved = agent.improve_actor(windows, second, jnp.float32(0.0), state, older, now, jax.random.key(5))
         gradients = [jax.grad(forecast_loss)(state.actor, x, now)["forecast"] for x in views]
         mean = moved.actor_opt_state[0].mu["forecast"]
         expected = jax.tree.map(lambda *g: sum(g) / len(g), *gradients)
@@ -236,7 +241,7 @@ def test_belief_by_hand() -> None:
     assert moved == {"encoder", "belief"}
 
 
-@pytest.mark.parametrize("wrong", [{"encoder": "mlp"}, {"second_age": "none"}])
+@pytest.mark.parametrize("wrong", [{"encoder": "mlp"}, {"second_age": "none", "pull_weight": 0.0}])
 def test_a_belief_needs_a_sequence_and_a_second_age(wrong: dict) -> None:
     with pytest.raises(DelayRLError, match="belief_weight needs encoder=transformer and a second_age"):
         replace(SEQUENTIAL, **wrong).for_run(Schedule())

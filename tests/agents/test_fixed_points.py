@@ -263,20 +263,27 @@ def test_critics_take_one_step_from_the_target_critics(name: str) -> None:
 # ---- any-age -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("weight", "distance"), [(0.0, "moments"), (1.0, "moments"), (1.0, "kl")])
-def test_any_age_ends_where_its_pull_leaves_it(weight: float, distance: Any) -> None:
-    """Without a pull at BPQL's policy. Gaussians cannot be the geometric mean, so that KL moves them too, but less."""
+@pytest.mark.parametrize(
+    ("encoder", "weight", "distance"),
+    [("mlp", 0.0, "moments"), ("mlp", 1.0, "moments"), ("mlp", 1.0, "kl"), ("forecast", 0.0, "moments")],
+)
+def test_any_age_ends_where_its_pull_leaves_it(encoder: Any, weight: float, distance: Any) -> None:
+    """Without a pull at BPQL's policy. Gaussians cannot be the geometric mean, so that KL moves them too, but less.
+
+    A forecast of one-hot states is their distribution, so that a policy on it loses nothing.
+    """
     solution = solve(bpql_value, pull=(weight, distance))
     narrower = (late(expected("bpql"))[1] - late(solution)[1]).max()
     assert narrower == pytest.approx(0.0 if weight == 0 else {"moments": 0.364, "kl": 0.246}[distance], abs=0.01)
     bpql = AGENTS["bpql"]
     constant = {"pull_hold": 1.0, "pull_end": 1.0, "run_steps": 10**6, "second_age": "zero"}
-    agent = AnyAge(bpql, pull_weight=weight, pull=distance, encoder="mlp", **constant)
+    agent = AnyAge(bpql, pull_weight=weight, pull=distance, encoder=encoder, **constant)
     state = agent.init(Spec(STATES, 1, 1), jax.random.key(1))
     for rate, updates in ((1e-2, 1200), (1e-3, 300)):
         agent = replace(agent, bpql=with_options(bpql, actor_learning_rate=rate, critic_learning_rate=rate))
         state = run(agent.update, state, windows(1), updates)
     np.testing.assert_allclose(q_table(state.critic), [solution.q[:, AT_ACTIONS]] * 2, atol=Q_MARGIN)
+    bpql = agent.learner
     assert_gaussians(bpql.policy(state.actor, histories()), *late(solution))
     fresh = jnp.concatenate([jnp.eye(STATES), jnp.zeros((STATES, 2))], -1)  # x_t of age 0
     assert_gaussians(bpql.policy(state.actor, fresh), solution.current.mean, np.exp(solution.current.log_std))

@@ -87,7 +87,7 @@ def test_backends_agree(name: str, tmp_path: Path, request: pytest.FixtureReques
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["vdpo", "bpql"])
+@pytest.mark.parametrize("name", ["vdpo", "bpql", "any-age"])
 def test_preset_paper_agrees(name: str, tmp_path: Path, controller: str) -> None:
     """The widths and depth of the preset, at HalfCheetah's sizes and Δ = 25."""
     agent, spec = REGISTRY[name].presets["paper"].agent, Spec(17, 6, 25)
@@ -101,9 +101,10 @@ def test_preset_paper_agrees(name: str, tmp_path: Path, controller: str) -> None
     np.testing.assert_allclose(ask(controller, path, inputs), expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["vdpo", "any-age"])
 @pytest.mark.parametrize("backend", ["numpy", "onnx", "jax"])
-def test_what_stands_after_the_age_is_not_read(backend: str, tmp_path: Path) -> None:
-    bundle = load_bundle(bundle_of(tmp_path / "bundle", policy_of("vdpo")), backend)
+def test_what_stands_after_the_age_is_not_read(name: str, backend: str, tmp_path: Path) -> None:
+    bundle = load_bundle(bundle_of(tmp_path / "bundle", policy_of(name)), backend)
     random = np.random.default_rng(0)
     obs = random.normal(size=bundle.obs_size)
     actions = random.uniform(bundle.low, bundle.high, (bundle.max_age, bundle.action_size))

@@ -149,6 +149,20 @@ def test_policies_that_are_not_the_weights(bundle: Path, name: str, value: Any) 
     refused(bundle, "")
 
 
+@pytest.mark.parametrize("value", [None, [], [0], [16] * 1000, "x", {}])
+def test_a_forecast_is_as_the_bundle_describes_it(value: Any, tmp_path: Path) -> None:
+    bundle = bundle_of(tmp_path / "bundle", policy_of("any-age"))
+    forge(bundle, lambda document: document["policy"].update(forecast=value))
+    refused(bundle, "forecast")
+    forge(bundle, lambda document: document["policy"].update(input="augmented", forecast=[16, 16]))
+    refused(bundle, "needs a forecast if its input is forecast, and must have none otherwise")
+    arrays = safetensors.numpy.load((bundle / WEIGHTS).read_bytes())
+    arrays.pop("forecast.0.norm.scale")
+    weights = safetensors.numpy.save(arrays)
+    forge(bundle, lambda document: document["policy"].update(input="forecast", forecast=[16, 16]), weights=weights)
+    refused(bundle, "the weights lack array 'forecast.0.norm.scale'")
+
+
 def test_a_transformer_needs_a_network_for_age_0(bundle: Path) -> None:
     arrays = safetensors.numpy.load((bundle / WEIGHTS).read_bytes())
     rest = {name: array for name, array in arrays.items() if not name.startswith("current.")}

@@ -43,12 +43,14 @@ class AnyAge:
     """The any-age agent."""
 
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, critic_norm="layer"))
-    second_age: Annotated[SecondAge, "the younger age that the actor learns at too: random in 0..d, or 0"] = "random"
-    pull: Annotated[Pull, "distance of the two policies: that of lifting's moments, or KL(older‖younger)"] = "moments"
-    pull_weight: Annotated[float, "initial weight of the pull towards the younger age", (0.0, 1e6)] = 0.0
-    pull_hold: Annotated[float, "part of the run in which the weight stays constant", (0.0, 1.0)] = 0.25
-    pull_end: Annotated[float, "part of the run after which the weight, falling linearly, is 0", (0.0, 1.0)] = 0.75
-    encoder: Annotated[Encoder, "how the actor reads x_t: by a forecast of s_t, flat, or as a sequence"] = "forecast"
+    second_age: Annotated[SecondAge, "the younger age that the actor learns at too: none, random in 0..d, or 0"] = (
+        "random"
+    )
+    pull: Annotated[Pull, "distance of the pull: of both policies' moments, or KL(older‖younger)"] = "moments"
+    pull_weight: Annotated[float, "initial weight of a pull towards the younger age; 0: none", (0.0, 1e6)] = 0.0
+    pull_hold: Annotated[float, "part of the run in which the pull's weight stays constant", (0.0, 1.0)] = 0.25
+    pull_end: Annotated[float, "part of the run after which the pull's weight is 0", (0.0, 1.0)] = 0.75
+    encoder: Annotated[Encoder, "how the actor reads x_t: flat, by a forecast of s_t, or as a sequence"] = "forecast"
     encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
     encoder_layers: Annotated[int, "transformer blocks"] = 2
     belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
@@ -72,6 +74,8 @@ class AnyAge:
         """Return the agent with the length of its run. Raises DelayRLError for options that contradict each other."""
         if self.pull_hold > self.pull_end:
             raise DelayRLError(f"pull_hold must be no later than pull_end, {self.pull_end}; got {self.pull_hold}")
+        if self.pull_weight and self.second_age == "none":
+            raise DelayRLError("pull_weight needs a second_age, the age to pull towards; without one give 0")
         if self.belief_weight and (self.encoder != "transformer" or self.second_age == "none"):
             raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
         return replace(self, run_steps=schedule.steps)
@@ -109,7 +113,7 @@ class AnyAge:
         return replace(self.bpql, actor_network=encoded)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """Update the critics as BPQL does, and the actor at two ages."""
+        """Update the critics as BPQL does, and the actor at its own and a younger age."""
         if (self.second_age == "none" and self.encoder != "forecast") or windows.delay == 0:
             return self.learner.update(state, windows, key, count)
         age_key, update_key = jax.random.split(key)
@@ -117,7 +121,7 @@ class AnyAge:
         younger = None if self.second_age == "none" else self.younger(windows, age_key)
         improve = functools.partial(self.improve_actor, windows, younger, weight)
         state, metrics = self.learner.update(state, windows, update_key, count, improve)
-        return state, metrics | {"pull_weight": weight}
+        return state, metrics | ({"pull_weight": weight} if self.pull_weight else {})
 
     def younger(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
         """Return x^(j)_t of each window, j uniform on 0..d, or 0, as the actor sees it."""
@@ -145,7 +149,7 @@ class AnyAge:
             action, log_prob = networks.sample(policy, key)
             q = networks.twin(state.critic, states, action)
             total = -soft_value(q, log_prob, temperature).mean()
-            if len(x) > 1:
+            if self.pull_weight and younger is not None:
                 total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.encoder == "forecast":
                 total += forecast_loss(actor, x, states)
@@ -160,7 +164,7 @@ class AnyAge:
         return state._replace(actor=actor, actor_opt_state=opt_state)
 
     def views(self, own: Float[Array, "batch input"], younger: Array | None) -> Float[Array, "ages batch input"]:
-        """Return what the actor learns at: one view of each sample, in turn of each age; with a pull, both."""
+        """Return what the actor learns at: each sample at its own age and the younger in turn; with a pull, at both."""
         if younger is None:
             return own[None]
         if self.pull_weight:

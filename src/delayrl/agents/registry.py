@@ -104,7 +104,7 @@ AGENTS: dict[str, Registration] = {
         replace(_VDPO, opening="agent", overrides={**OFFICIAL.overrides, "at_age_0": "random"}),
     ),
     "any-age": Registration(
-        "BPQL whose actor sees a forecast of s_t, which learns from the states alone, at every age",
+        "BPQL whose actor acts on a forecast of s_t, learned from states alone, at every age",
         "-",
         _presets(AnyAge(_LAYER_NORMED), AnyAge(_LAYER_NORMED), AnyAge(replace(_SMALL_BPQL, critic_norm="layer"))),
     ),

@@ -10,6 +10,8 @@ from delayrl.core.views import input_size
 
 RATE = 0.01
 """Rate at which the deviations of the changes follow a batch's."""
+LEAST_DEVIATION = 1e-2
+"""So that an entry that hardly changes is not blown up."""
 
 
 def forecast_init(key: Key, spec: Spec, hidden: tuple[int, ...], outputs: int) -> Params:
@@ -41,10 +43,13 @@ def forecast_loss(params: Params, x: Float[Array, "*batch input"], state: Float[
 
 
 def follow_changes(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Params:
-    """Return the parameters with deviations that have moved towards the root mean square of a batch's changes."""
+    """Return the parameters with deviations that have moved towards the root mean square of a batch's changes.
+
+    A sample of age 0 counts as one without change.
+    """
     change = _change(x, state).reshape(-1, state.shape[-1])
     square = (1 - RATE) * params["deviation"] ** 2 + RATE * (change**2).mean(0)
-    return params | {"deviation": jnp.sqrt(square + 1e-8)}
+    return params | {"deviation": jnp.maximum(jnp.sqrt(square), LEAST_DEVIATION)}
 
 
 def _late(x: Array) -> Array:

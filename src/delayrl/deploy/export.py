@@ -66,7 +66,8 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
         return tuple(layer["b"].shape[0] for layer in mlp[:-1])
 
     kind = "augmented" if parts.sees == "augmented" and spec.delay else "observation"
-    tree, sizes = {"head": mean(parts.head)}, dict[str, Any]()
+    tree = {"head": mean(parts.head)}
+    sizes: dict[str, Any] = {}
     if parts.current is not None:
         tree["current"] = mean(parts.current)
     if parts.forecast is not None:
@@ -97,7 +98,7 @@ def describe(run: RunFolder, step: int, longest: int, task: Task) -> dict[str, A
         "observation": described(env.observation_space),
         "action": described(env.action_space),
         "normalisation": {
-            "observation": "inside the first layers: the bundle takes the task's own numbers"
+            "observation": "inside the networks: the bundle takes the task's own numbers"
             if config["schedule"].get("observation_norm") == "running"
             else "none: the task's own numbers",
             "action": "inside, low .. high is -1 .. 1; the bundle takes and gives the task's own units",

@@ -24,7 +24,7 @@ class Network:
 
     `input` is what the MLP `head` reads: "observation" [S]; "augmented" [S + Δ·A + 1], which is the observation, the
     scaled actions since (zeros after the first `age`) and age / Δ; "forecast" [S], the observation plus, above
-    age 0, the output of the MLP `forecast`, which reads the same and has a layer norm before each ReLU; or
+    age 0, the output of the MLP `forecast`, which reads that vector and has a layer norm before each ReLU; or
     "transformer" [width], the encoder's output at the age. A last MLP, `current`, may act at age 0. It reads the
     observation.
     """
@@ -135,6 +135,8 @@ def parse(document: Any) -> Network:
         raise DelayRLError("its policy's input is transformer, which has no output at age 0: it needs a current")
     hidden = widths("hidden")
     current = None if document.get("current") is None else widths("current")
+    if (kind == "forecast") != (document.get("forecast") is not None):
+        raise DelayRLError("its policy needs a forecast if its input is forecast, and must have none otherwise")
     forecast = widths("forecast") if kind == "forecast" else None
     least = int(kind == "transformer")
     width = integer("width", least, document.get("width"))
