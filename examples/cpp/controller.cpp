@@ -296,6 +296,7 @@ class Policy {
         if (described.at("current").kind == Json::list)
             current_ = network(weights, "current", obs_size, described.at("current"), action_size);
         if (input_ == "forecast") {
+            if (current_.empty()) current_ = head_;  // at age 0 the observation is the forecast
             forecast_ = network(weights, "forecast", augmented, described.at("forecast"), obs_size);
             for (std::size_t i = 0; i + 1 < forecast_.size(); ++i)
                 norms_.push_back(norm(weights, "forecast." + std::to_string(i) + ".norm", forecast_[i].outputs));
@@ -326,12 +327,12 @@ class Policy {
             action = mlp(head_, encode(obs, scaled, age));
         } else {
             Floats x = obs;
-            if (input_ == "augmented" || (input_ == "forecast" && age > 0)) {
+            if (input_ != "observation") {
                 x.insert(x.end(), scaled.begin(), scaled.end());
                 x.resize(obs_size + max_age * action_size);
                 x.push_back(static_cast<float>(age) / static_cast<float>(max_age));
             }
-            if (input_ == "forecast" && age > 0) {
+            if (input_ == "forecast") {
                 x = mlp(forecast_, x, norms_);
                 for (std::size_t j = 0; j < obs_size; ++j) x[j] += obs[j];
             }

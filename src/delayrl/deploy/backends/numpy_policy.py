@@ -50,15 +50,15 @@ def numpy_policy(network: Network, arrays: Arrays) -> Act:
     """Return the policy as a function."""
     low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
     gain, half = 2 / (high - low), (high - low) / 2
-    current = layers(arrays, "current")
     encoder, head = fold(network, arrays) if network.input == "transformer" else (None, layers(arrays, "head"))
     forecast, norms = layers(arrays, "forecast"), layer_norms(arrays, "forecast")
+    current = layers(arrays, "current") or (head if forecast else [])  # at age 0 the observation is the forecast
 
     def act(obs: Array, actions: Array, age: int) -> Array:
         if age == 0 and current:
             return low + (np.tanh(_mlp(current, obs)) + 1) * half
         x = obs
-        if network.input != "observation" and (age or not forecast):
+        if network.input != "observation":
             scaled = (actions[:age] - low) * gain - 1
             if encoder is not None:
                 x = _encode(encoder, obs, scaled)
