@@ -235,6 +235,18 @@ def test_register_is_cheap_and_repeatable() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
 
 
+@pytest.mark.parametrize("task", ["HalfCheetah", "Swimmer"])
+def test_v5_is_the_same_task_to_the_last_bit(task: str) -> None:
+    ours, newer = make(task), gymnasium.make(f"{task}-v5")
+    rng = np.random.default_rng(0)
+    for seed in range(2):
+        np.testing.assert_array_equal(ours.reset(seed=seed)[0], newer.reset(seed=seed)[0])
+        for action in rng.uniform(-1, 1, (300, *ours.action_space.shape)).astype(np.float32):
+            (obs, *rest, _), (newer_obs, *newer_rest, _) = ours.step(action), newer.step(action)
+            np.testing.assert_array_equal(obs, newer_obs)
+            assert rest == newer_rest  # reward, terminated, truncated
+
+
 def test_render_mode_passes_through() -> None:
     assert make("Ant", render_mode="rgb_array").render_mode == "rgb_array"
     assert make("Pusher", render_mode="rgb_array").metadata["render_fps"] == 20
