@@ -326,7 +326,7 @@ def main() -> None:
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
-    if (rows := HERE / "results" / "any-age-ladder.sqlite").exists():
+    if rows := sorted((HERE / "results").glob("any-age-*.sqlite"), reverse=True):
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", ladder.section(rows, images / "ladder.png"))
     if forecast.OUT.exists():
         insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())

@@ -16,16 +16,17 @@ AWAY = 1_500
 BASE = "bpql"
 
 
-def section(file: Path, picture: Path) -> str:
+def section(files: list[Path], picture: Path) -> str:
     """Draw the curves, and return the table with what made it."""
-    collected = read_table(file)
-    cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
-    results = [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
+    files_read, results = [read_table(file) for file in files], []
+    for collected in files_read:
+        cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
+        results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
-    versions = collected.versions[0]
+    versions = files_read[0].versions[0]
     made = f"{versions['cores']} x86 cores, jax {versions['jax']}, MuJoCo {versions['mujoco']}"
-    return f"{table(learners)}\n\n{made}. Rows: `benchmarks/results/{file.name}`."
+    return f"{table(learners)}\n\n{made}. Rows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
 
 
 def area(result: Result) -> statistics.Floats:
