@@ -47,14 +47,16 @@ def table(results: list[Result]) -> str:
     """Return a Markdown table of the arms, compared with BPQL on the same SAC."""
     base = next((area(r) for r in results if name(r) == f"`{BASE}`"), None)
     head = ["arm", "seeds", "mean return over training", "times BPQL's", "difference, 95 % interval", "at the end"]
-    lines = ["| " + " | ".join([*head, f"seeds above {AWAY:,}"]) + " |", "|" + " --- |" * (len(head) + 1)]
+    head += [f"seeds above {AWAY:,}", "GFLOP a step"]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for result in results:
         own, final = area(result), result.curves.final
         compared = base is not None and name(result) != f"`{BASE}`"
         times = f"{own.mean() / base.mean():.2f}" if compared and base is not None else ""
         apart = difference(own, base) if compared else ""
         cells = [name(result), str(result.runs), spread(own), times, apart, spread(final)]
-        lines.append("| " + " | ".join([*cells, f"{int((final > AWAY).sum())} of {final.size}"]) + " |")
+        cost = f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
+        lines.append("| " + " | ".join([*cells, f"{int((final > AWAY).sum())} of {final.size}", cost]) + " |")
     return "\n".join(lines)
 
 

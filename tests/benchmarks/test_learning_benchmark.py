@@ -15,6 +15,7 @@ from learning import times  # noqa: E402
 from delayrl.report.results import Curves, Place, Result, Setting  # noqa: E402
 from delayrl.run.cell import Progress  # noqa: E402
 from delayrl.run.condition import Condition  # noqa: E402
+from delayrl.run.cost import Cost  # noqa: E402
 
 
 def write(folder: Path, side: str, seed: int, returns: list[float | None]) -> None:
@@ -45,7 +46,8 @@ def result(agent: str, delay: int, returns: list[list[float]], **overrides: floa
     condition = Condition(agent, "X-v0", delay, preset="matched", overrides={"precision": "bfloat16", **overrides})
     place = Place(Setting("corrected", "matched"), "X-v0", delay, agent)
     curves = Curves(np.arange(1, len(returns[0]) + 1), np.array(returns))
-    return Result(place, condition, Progress("done", 2), len(returns), False, False, curves)
+    cost = Cost(100, {}, (8,), 1.234e9)
+    return Result(place, condition, Progress("done", 2), len(returns), False, False, curves, cost=cost)
 
 
 def test_the_ladder_compares_with_bpql() -> None:
@@ -58,6 +60,6 @@ def test_the_ladder_compares_with_bpql() -> None:
     own = ladder.area(arm).mean()
     assert float(cells[0][3]) == pytest.approx(own / 1100, abs=0.01)
     assert cells[0][4].startswith(f"+{own - 1100:,.0f} (")
-    assert cells[0][6] == "1 of 2"
+    assert cells[0][6:] == ["1 of 2", "1.23"]
     assert cells[1][3:5] == ["", ""]
     assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
