@@ -219,3 +219,27 @@ def test_gradients_of_a_layer(shape: tuple[int, ...]) -> None:
     for one, other, several in zip(expected, alone, seeds, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-3)
         np.testing.assert_allclose(one, several[1], rtol=1e-4, atol=2e-3)
+
+
+@pytest.mark.parametrize("shape", [(7,), (40, 7), (2, 40, 7)])
+def test_gradients_of_layer_norm(shape: tuple[int, ...]) -> None:
+    """Written out for speed: those that JAX takes of the formula, for inputs far from mean 0, alone and for seeds."""
+    random = np.random.default_rng(0)
+    x = jnp.asarray(5 + 3 * random.normal(size=shape), jnp.float32)
+    scale, shift = (jnp.asarray(random.normal(size=7), jnp.float32) for _ in range(2))
+
+    def formula(params: dict, x: jax.Array) -> jax.Array:
+        variance = x.var(-1, keepdims=True)
+        return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(variance + 1e-5) * params["scale"] + params["shift"]
+
+    def gradients(norm: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.grad(lambda a, b, x: jnp.sin(norm({"scale": a, "shift": b}, x)).sum(), (0, 1, 2))
+
+    params = {"scale": scale, "shift": shift}
+    np.testing.assert_allclose(networks.layer_norm(params, x), formula(params, x), rtol=1e-4, atol=1e-5)
+    expected = gradients(formula)(scale, shift, x)
+    alone = gradients(networks.layer_norm)(scale, shift, x)
+    seeds = jax.vmap(gradients(networks.layer_norm))(*(jnp.stack([0 * y, y]) for y in (scale, shift, x)))
+    for one, other, several in zip(expected, alone, seeds, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-5)
+        np.testing.assert_allclose(one, several[1], rtol=1e-4, atol=2e-5)
