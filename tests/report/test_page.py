@@ -167,6 +167,16 @@ def test_page_filters(opened: Any) -> None:
     assert set(column(view, "all", 0)) == {"delayrl/Ant-v4", "delayrl/Hopper-v4"}
 
 
+def test_page_compares_each_two_agents(opened: Any) -> None:
+    cells, every = sampled()
+    view, shown = opened(cells, every), payload(summarise(every, cells), "")
+    lines = {(c["delay"], c["one"]) for c in shown["comparisons"]}
+    assert view.locator("#comparison tbody tr").count() == len(lines)
+    assert view.locator("#comparison tbody td b").count() == sum(c["clear"] for c in shown["comparisons"])
+    first = view.locator("#comparison thead th").all_inner_texts()[2].removeprefix("over ")
+    assert first == shown["agents"][min(c["other"] for c in shown["comparisons"])]["name"]
+
+
 def test_page_draws_curves_and_shows_values(opened: Any) -> None:
     view = opened(*sampled())
     assert view.locator("#curves figure").count() == 8  # 2 tasks × 4 delays
@@ -188,7 +198,7 @@ def test_page_draws_curves_and_shows_values(opened: Any) -> None:
 
 def test_page_marks_what_goes_on(opened: Any) -> None:
     view = opened(*sampled())
-    states = column(view, "all", 11)
+    states = column(view, "all", 12)
     assert "at 400,000 of 1,000,000 steps" in states
     assert "failed at 200,000 of 1,000,000 steps" in states
     assert "todo" in states

@@ -12,6 +12,7 @@ from delayrl.report.markdown import markdown
 from delayrl.report.page import page
 from delayrl.report.results import Place, Result, Setting
 from delayrl.report.summary import Summary, summarise
+from delayrl.run.cell import Progress
 
 PAPER = Setting("corrected", "paper")
 
@@ -102,7 +103,7 @@ def test_steps_to_the_threshold_have_an_interval() -> None:
     assert result.seeds_at_threshold == 1
     text = markdown(summary, "t", {})
     assert "**×**<br>200 to ×<br>raw 0.00 ± 0.00<br>1/2 seeds" in text
-    assert "| ×<br>200 to × | 2/2 | 300 | done |" in text
+    assert "| ×<br>200 to × | 2/2 | 300 |  | done |" in text
 
 
 @pytest.mark.parametrize("change", [{"protocol": "official"}, {"steps": 200}, {"preset": "small"}])
@@ -212,3 +213,16 @@ def test_rows_of_two_things_under_one_cell() -> None:
     rows = [row(c, 0, 100, 1.0), row(c, 0, 200, 1.0) | {"env": "Hopper-v4"}]
     with pytest.raises(DelayRLError, match=r"rows of cell .* are of different things"):
         summarise(rows, [c])
+
+
+def test_hours_of_all_cells_of_a_result() -> None:
+    """300 steps at 10 and at 20 steps a second: 45 s. Unknown where a cell that has begun says no speed."""
+    parts = [standing("bpql", "Ant-v4", 5, (seed,), id=str(seed), steps=300) for seed in range(3)]
+    every = [r for seed, cell in enumerate(parts) for r in curve(cell, seed, [0, 0, 1])]
+    speeds = [Progress("done", 300, 10.0), Progress("done", 300, 20.0), Progress("todo", 0)]
+    cells = [(cell, speed) for (cell, _), speed in zip(parts, speeds, strict=True)]
+    place = Place(Setting("corrected", "paper"), "Ant-v4", 5, "bpql")
+    assert summarise(every, cells).results[place].hours == pytest.approx(45 / 3600)
+    assert "| 0.013 |" in markdown(summarise(every, cells), "t", {})
+    cells[2] = parts[2]
+    assert math.isnan(summarise(every, cells).results[place].hours)

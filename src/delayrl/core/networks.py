@@ -53,11 +53,6 @@ def layer_norm(params: Params, x: Float[Array, "*batch width"]) -> Float[Array, 
     return _layer_norm(params["scale"], params["shift"], x)
 
 
-@jax.custom_vjp
-def _layer_norm(scale: Array, shift: Array, x: Array) -> Array:
-    return _layer_norm_forward(scale, shift, x)[0]
-
-
 def _layer_norm_forward(scale: Array, shift: Array, x: Array) -> tuple[Array, tuple[Array, Array, Array]]:
     centred = x - _mean(x)
     rate = jax.lax.rsqrt(_mean(centred**2) + 1e-5)
@@ -71,6 +66,7 @@ def _layer_norm_slopes(kept: tuple[Array, Array, Array], slope: Array) -> tuple[
     return (slope * normal).sum(rows), slope.sum(rows), x_slope
 
 
+_layer_norm = jax.custom_vjp(lambda scale, shift, x: _layer_norm_forward(scale, shift, x)[0])
 _layer_norm.defvjp(_layer_norm_forward, _layer_norm_slopes)  # fewer passes than JAX's own gradient: docs/performance.md
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from delayrl.report import wording
+from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Result, Setting, agent_order
 from delayrl.report.statistics import mean_std
 from delayrl.report.summary import Aggregate, Summary
@@ -36,6 +37,8 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
             parts += ["### Interquartile mean of the normalised return over tasks", _aggregates(summary, aggregates)]
         alternative = "Interquartile means and performance profiles"
         parts += [f"![{alternative}](img/{file})" for file in pictures.get((setting, "aggregates"), [])]
+        if comparisons := [c for c in summary.comparisons if c.setting == setting]:
+            parts += ["### Which is better", wording.COMPARISON_CAPTION, _comparisons(summary, comparisons)]
         for kind, name in (("curves", "Learning curves"), ("delay", "Return against delay")):
             files = pictures.get((setting, kind), [])
             if files:
@@ -89,6 +92,24 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
     return _table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
 
 
+def _comparisons(summary: Summary, comparisons: Sequence[Comparison]) -> str:
+    at = {(c.delay, c.one, c.other): c for half in comparisons for c in (half, half.turned())}
+    labels, body = sorted({one for _, one, _ in at}, key=agent_order), []
+    for delay in dict.fromkeys(c.delay for c in comparisons):
+        for one in labels:
+            if not any((delay, one, other) in at for other in labels):
+                continue
+            line = ["all constant" if delay is None else _escape(delay), _escape(summary.name(one))]
+            for other in labels:
+                c = at.get((delay, one, other))
+                p, within, difference = wording.comparison_texts(c) if c else ("", "", "")
+                p, difference = f"**{p}**" if c and c.clear else p, GREY.format(difference) if difference else ""
+                parts = [p, within, difference]
+                line.append("<br>".join(part for part in parts if part))
+            body.append(line)
+    return _table(["Δ", "Agent", *(f"over {_escape(summary.name(label))}" for label in labels)], body)
+
+
 def _anchors(results: Iterable[Result]) -> str:
     body = {}
     for r in results:
@@ -108,6 +129,18 @@ def _results(summary: Summary, results: Iterable[Result]) -> str:
         seeds, state = f"{r.runs}/{r.seeds}", r.unfinished or r.progress.state
         final = "<br>".join(filter(None, (normalised, wording.interval(r.final_interval, wording.normalised))))
         reached = "<br>".join(filter(None, (wording.reached(r), wording.interval(r.steps_interval, wording.steps))))
-        body.append((*names, raw, final, area, reached, seeds, f"{r.condition.steps:,}", state))
-    heads = ("Task", "Δ", "Agent", "Return", "Normalised", "Area", "Steps to Ret_df", "Seeds", "Steps", "State")
-    return _table(heads, body)
+        body.append((*names, raw, final, area, reached, seeds, f"{r.condition.steps:,}", wording.hours(r.hours), state))
+    heads = (
+        "Task",
+        "Δ",
+        "Agent",
+        "Return",
+        "Normalised",
+        "Area",
+        "Steps to Ret_df",
+        "Seeds",
+        "Steps",
+        "Hours",
+        "State",
+    )
+    return f"{wording.CELLS_CAPTION}\n\n{_table(heads, body)}"

@@ -15,6 +15,7 @@ from importlib import resources
 from typing import Any
 
 from delayrl.report import figures, wording
+from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
 from delayrl.report.summary import THRESHOLDS, Aggregate, Summary
@@ -66,8 +67,11 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "costs": [wording.costs(summary, s) for s in settings],
         "costHead": wording.COST_HEAD,
         "costCaption": wording.COST_CAPTION,
+        "cellsCaption": wording.CELLS_CAPTION,
         "thresholds": _rounded(THRESHOLDS),
         "aggregates": [_aggregate(a, names) for a in summary.aggregates],
+        "comparisons": [_comparison(c, names) for half in summary.comparisons for c in (half, half.turned())],
+        "comparisonCaption": wording.COMPARISON_CAPTION,
     }
 
 
@@ -100,6 +104,7 @@ def _result(r: Result, names: Names) -> dict[str, Any]:
         "runs": r.runs,
         "seeds": r.seeds,
         "total": r.condition.steps,
+        "hours": [wording.hours(r.hours), _rounded(r.hours)],
         "raw": _rounded(mean_std(curves.final)),
         "normalised": _rounded(mean_std(r.final)),
         "interval": wording.interval(r.final_interval, wording.normalised),
@@ -138,6 +143,15 @@ def _table(table: Table, names: Names) -> dict[str, Any]:
     labels = {"kind": table.kind, "title": table.title, "caption": caption}
     columns = [names["agents"].index(column) for column in table.columns]
     return labels | {"setting": names["settings"].index(table.setting), "columns": columns, "rows": rows}
+
+
+def _comparison(c: Comparison, names: Names) -> dict[str, Any]:
+    delay = None if c.delay is None else names["delays"].index(c.delay)
+    place = {"setting": names["settings"].index(c.setting), "delay": delay}
+    agents = {"one": names["agents"].index(c.one), "other": names["agents"].index(c.other)}
+    return (
+        place | agents | {"sort": _rounded(c.probability.value), "clear": c.clear, "texts": wording.comparison_texts(c)}
+    )
 
 
 def _aggregate(a: Aggregate, names: Names) -> dict[str, Any]:

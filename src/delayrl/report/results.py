@@ -82,6 +82,7 @@ class Result:
     privileged: bool  # whether its behaviour reads the true state while it trains
     curves: Curves  # of the complete seeds; where there is none yet, of all
     cost: Cost | None = None  # of learning, where its runs say so
+    hours: float = NAN  # that its cells took, added up; NaN where a speed is unknown
     options_known: bool = True  # whether a grid or the configurations of all its runs say its options
     random_anchor: Anchor = NO_ANCHOR  # its returns are normalised by this
     reference_anchor: Anchor = NO_ANCHOR  # and by this
@@ -223,8 +224,15 @@ def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup], 
         any(group.privileged for group in groups),
         Curves(*statistics.common_steps([runs[seed] for seed in sorted(kept)])),
         next((group.cost for group in groups if group.cost), None),
+        _hours(progress),
         not inferred or all(group.config for group in groups),
     )
+
+
+def _hours(progress: Sequence[Progress]) -> float:
+    """Add up the time of cells, each at the speed that it has reported."""
+    begun = [p for p in progress if p.step]
+    return sum(p.step / p.speed if p.speed else NAN for p in begun) / 3600 if begun else NAN
 
 
 def _state(states: set[CellState], has_rows: bool) -> CellState:

@@ -137,6 +137,34 @@ def bootstrap_steps(
     return float(low), float(high)
 
 
+def probability_of_improvement(one: ArrayLike, other: ArrayLike) -> Floats:
+    """Return how often a run of `one`, [..., n], is above a run of `other`, [..., m]; a tie counts half."""
+    x, y = np.asarray(one, float), np.asarray(other, float)
+    return (1 + np.sign(x[..., :, None] - y[..., None, :]).mean((-1, -2))) / 2
+
+
+def improvement_interval(
+    pairs: Sequence[tuple[Floats, Floats]], repetitions: int = REPETITIONS, seed: int = 0
+) -> tuple[float, float]:
+    """Estimate the 95 % percentile interval of the mean probability of improvement over tasks.
+
+    Args:
+        pairs: final returns of two agents, [n] and [m], for each task; runs are resampled within their agent and task.
+        repetitions: how many resamples.
+        seed: the same returns and seed give the same interval.
+
+    Returns:
+        Lower and upper bound; NaN with fewer than two runs of either on a task.
+    """
+    if min(x.size for pair in pairs for x in pair) < 2:
+        return NAN, NAN
+    random = np.random.default_rng(seed)
+    resampled = [[_resample(random, x, repetitions) for x in pair] for pair in pairs]
+    means = np.mean([probability_of_improvement(*pair) for pair in resampled], axis=0)
+    low, high = np.percentile(means, PERCENTILES)
+    return float(low), float(high)
+
+
 def _resample(random: np.random.Generator, values: Floats, repetitions: int) -> Floats:
     """Draw as many of the values, along the first axis, as there are, with replacement: [repetitions, ...]."""
     return values[random.integers(len(values), size=(repetitions, len(values)))]

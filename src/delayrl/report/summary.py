@@ -9,6 +9,7 @@ import numpy as np
 
 from delayrl.errors import DelayRLError
 from delayrl.report import statistics
+from delayrl.report.comparisons import Comparison, make_comparisons
 from delayrl.report.configurations import by_key, distinct_overrides
 from delayrl.report.results import Place, Result, Setting, agent_order, delay_order, make_results
 from delayrl.report.rows import RowGroup, group_rows
@@ -38,12 +39,13 @@ class Aggregate(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """Results, tables and aggregates."""
+    """Results, tables, aggregates and comparisons."""
 
     results: dict[Place, Result]  # in the order of their places
     shared: dict[str, Mapping[str, Any]]  # overrides that all cells of an agent have, by agent
     tables: list[Table]
     aggregates: list[Aggregate]
+    comparisons: list[Comparison]
     unplaced: int  # how many rows belong to no cell
 
     @property
@@ -65,7 +67,7 @@ class Summary:
 def summarise(
     rows: Iterable[Mapping[str, Any]], standing: Standing = (), configs: Iterable[Mapping[str, Any]] = ()
 ) -> Summary:
-    """Compute results, tables and aggregates.
+    """Compute results, tables, aggregates and comparisons.
 
     Args:
         rows: as in a run's rows.jsonl, in any order, read once. Column "cell" names the cell.
@@ -91,7 +93,8 @@ def summarise(
             raise DelayRLError(f"the rows of cell {id} are of different things: {group_of[id].key} and {group.key}")
     labels, shared = _label_cells([cell for cell, _ in standing])
     results = make_results(standing, group_of, labels, inferred=inferred)
-    return Summary(results, shared, make_tables(results), _make_aggregates(results.values()), unplaced)
+    tables, every = make_tables(results), results.values()
+    return Summary(results, shared, tables, _make_aggregates(every), make_comparisons(every), unplaced)
 
 
 Placed = list[tuple[str, RowGroup]]

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Anchor, Result, Setting, agent_order
 from delayrl.report.statistics import SMOOTHED, mean_std
 from delayrl.report.summary import Summary
@@ -98,6 +99,35 @@ def caption(table: Table) -> str:
         "Final return, mean ± standard deviation over seeds; 95 % interval of the mean, with the anchors' uncertainty. "
         "Area: normalised mean return over training. Raw: return after the last step."
     )
+
+
+CELLS_CAPTION = (
+    "Returns after the last step. Hours: of one worker, on a CPU one core, for all seeds together; as long as it took "
+    "beside whatever else the machine did."
+)
+COMPARISON_CAPTION = (
+    "How probable it is that a run of the row's agent ends above one of the column's on the same task: mean over tasks "
+    "that both have ended on, 95 % interval by bootstrap over runs within their task, bold where it excludes 0.5. "
+    "Below it, the difference of their mean normalised returns, with the anchors' uncertainty."
+)
+
+
+def comparison_texts(comparison: Comparison) -> tuple[str, str, str]:
+    """Write the probability, its interval, and the difference of normalised returns with its own."""
+    p, d = comparison.probability, comparison.difference
+    within = interval((d.low, d.high), signed)
+    difference = "" if math.isnan(d.value) else signed(d.value) + (f" ({within})" if within else "")
+    return normalised(p.value), interval((p.low, p.high), normalised), difference
+
+
+def hours(value: float) -> str:
+    """Write hours with two digits or more; empty if they are unknown."""
+    return "" if math.isnan(value) else f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def signed(value: float) -> str:
+    """Write a difference of normalised returns."""
+    return f"{value:+.2f}"
 
 
 COST_HEAD = ("Agent", "Reads the true state", "Parameters", "Gradient steps", "Batch", "FLOP")

@@ -1,0 +1,95 @@
+"""Which of two agents is better: on the tasks of one delay, or of all constant ones, that both have ended on."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from delayrl.report import statistics
+from delayrl.report.results import Result, Setting, agent_order, delay_order
+from delayrl.report.statistics import NAN, Floats, Stratum
+
+
+class Estimate(NamedTuple):
+    """A number with its 95 % interval; NaN where it is unknown."""
+
+    value: float
+    low: float = NAN
+    high: float = NAN
+
+
+class Comparison(NamedTuple):
+    """Two agents, by label."""
+
+    setting: Setting
+    delay: int | str | None  # None stands for all constant delays
+    one: str
+    other: str
+    probability: Estimate  # that a run of `one` ends above one of `other` on the same task: mean over tasks
+    difference: Estimate  # of their mean normalised final returns, NaN without anchors
+    tasks: int  # over all constant delays each task counts with each delay
+
+    @property
+    def clear(self) -> bool:
+        """Whether the interval of the probability excludes a half."""
+        return self.probability.low > 0.5 or self.probability.high < 0.5
+
+    def turned(self) -> Self:
+        """Return the same from the other's side."""
+        (p, p_low, p_high), (d, d_low, d_high) = self.probability, self.difference
+        turned = Estimate(1 - p, 1 - p_high, 1 - p_low), Estimate(-d, -d_high, -d_low)
+        return self._replace(one=self.other, other=self.one, probability=turned[0], difference=turned[1])
+
+
+Pair = tuple[Result, Result]
+
+
+def make_comparisons(results: Iterable[Result]) -> list[Comparison]:
+    """Compare each two learners whose seeds have ended, in the order of their labels."""
+    ended: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
+    for result in results:
+        if not result.is_anchor and not result.partial and result.runs:
+            ended[result.place.setting, result.place.delay].append(result)
+            if isinstance(result.place.delay, int):
+                ended[result.place.setting, None].append(result)
+    delays = {
+        setting: {delay for of, delay in ended if of == setting and isinstance(delay, int)} for setting, _ in ended
+    }
+    comparisons = []
+    for setting, delay in sorted(ended, key=lambda key: (key[0], key[1] is None, delay_order(key[1] or 0))):
+        if delay is None and len(delays[setting]) < 2:
+            continue
+        at: dict[str, dict[object, Result]] = defaultdict(dict)
+        for result in ended[setting, delay]:
+            at[result.place.label][result.place.env, result.place.delay, result.condition.steps] = result
+        for one, other in combinations(sorted(at, key=agent_order), 2):
+            pairs = [(result, at[other][key]) for key, result in at[one].items() if key in at[other]]
+            if pairs:
+                comparisons.append(
+                    Comparison(setting, delay, one, other, _probability(pairs), _difference(pairs), len(pairs))
+                )
+    return comparisons
+
+
+def _probability(pairs: Sequence[Pair]) -> Estimate:
+    finals = [(one.curves.final, other.curves.final) for one, other in pairs]
+    value = np.mean([statistics.probability_of_improvement(*pair) for pair in finals])
+    return Estimate(float(value), *statistics.improvement_interval(finals))
+
+
+def _difference(pairs: Sequence[Pair]) -> Estimate:
+    value = float(np.mean([one.final.mean() - other.final.mean() for one, other in pairs]))
+    if np.isnan(value):
+        return Estimate(NAN)
+    strata: dict[object, Stratum] = {}  # one for each task and length: its conditions share their anchors
+    weights: dict[object, list[Floats]] = defaultdict(list)
+    for one, other in pairs:
+        key, (random, reference, _) = (one.place.env, one.condition.steps), one.stratum
+        finals = [one.curves.final, other.curves.final]
+        strata[key] = Stratum(random, reference, [*(strata[key].returns if key in strata else ()), *finals])
+        weights[key] += [np.full(x.size, sign / x.size / len(pairs)) for x, sign in zip(finals, (1, -1), strict=True)]
+    weight = np.concatenate([part for parts in weights.values() for part in parts])
+    low, high = statistics.stratified_bootstrap([*strata.values()], lambda scores: scores @ weight)
+    return Estimate(value, float(low), float(high))
