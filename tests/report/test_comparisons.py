@@ -16,6 +16,7 @@ from delayrl.report.comparisons import Comparison
 from delayrl.report.markdown import markdown
 from delayrl.report.page import payload
 from delayrl.report.summary import Summary, summarise
+from delayrl.report.wording import signed
 
 RETURNS = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=8)
 
@@ -135,3 +136,7 @@ def test_one_run_has_no_interval_and_is_not_clear() -> None:
     (comparison,) = comparisons.values()
     assert not comparison.clear
     assert "| 5 | bpql |  | 1.00 |" in markdown(summary, "t", {})
+
+
+def test_a_difference_has_a_sign_unless_it_is_nothing() -> None:
+    assert [signed(x) for x in (0.123, -0.126, -0.001, 0.004)] == ["+0.12", "-0.13", "0.00", "0.00"]

@@ -126,8 +126,9 @@ def hours(value: float) -> str:
 
 
 def signed(value: float) -> str:
-    """Write a difference of normalised returns."""
-    return f"{value:+.2f}"
+    """Write a difference of normalised returns; 0.00 has no sign."""
+    text = f"{value:+.2f}"
+    return text if float(text) else text[1:]
 
 
 COST_HEAD = ("Agent", "Reads the true state", "Parameters", "Gradient steps", "Batch", "FLOP")
