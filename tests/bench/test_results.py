@@ -154,15 +154,49 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
     collect(grid, runs, file)
     with pytest.raises(delayrl.DelayRLError, match="the table of the grid 'mixed'"):
         collect(Grid("other", "", grid.source, grid.cells), runs, file)
-    shutil.copytree(runs, tmp_path / "fewer")
-    shutil.rmtree(tmp_path / "fewer" / grid.cells[0].folder / "seed1")
     before = file.read_bytes()
-    with pytest.raises(delayrl.DelayRLError, match=r"has \d+ rows, and below .* are only \d+; give another --out"):
-        collect(grid, tmp_path / "fewer", file)
+    with pytest.raises(
+        delayrl.DelayRLError, match=rf"cells that mixed no longer has: {grid.cells[0].id}; give another"
+    ):
+        collect(replace(grid, cells=grid.cells[1:]), runs, file)
     assert file.read_bytes() == before
+    with pytest.raises(delayrl.DelayRLError, match="there is no table"):
+        collect(grid, runs, file, [tmp_path / "nowhere.sqlite"])
     with pytest.raises(delayrl.DelayRLError, match="has no rows"):
         collect(grid, tmp_path / "elsewhere", tmp_path / "none.sqlite")
     assert not (tmp_path / "none.sqlite").exists()
+
+
+def test_what_is_collected_stays(finished, tmp_path: Path) -> None:
+    """Where run folders are gone, or hold less, the table's own rows stay, to the last byte; more rows replace them."""
+    grid, runs = finished
+    file, part = tmp_path / "t.sqlite", tmp_path / "part"
+    shutil.copytree(runs, part)
+    rows = part / grid.cells[0].folder / "seed1" / "rows.jsonl"
+    rows.write_text("".join(rows.read_text().splitlines(keepends=True)[:2]))
+    assert collect(grid, part, file) == 6
+    assert collect(grid, runs, file) == 8
+    whole = file.read_bytes()
+    for folder in (part, tmp_path / "gone"):
+        assert collect(grid, folder, file) == 8
+        assert file.read_bytes() == whole
+
+
+def test_cells_of_other_tables(finished, tmp_path: Path) -> None:
+    """A grid that shares a cell takes it from the other's table, with all that the table knows of it."""
+    grid, runs = finished
+    collect(grid, runs, tmp_path / "theirs.sqlite")
+    ours = Grid("ours", "", Path("ours.toml"), grid.cells[::-1])
+    with pytest.raises(delayrl.DelayRLError, match="has no rows"):
+        collect(ours, tmp_path / "gone", tmp_path / "ours.sqlite")
+    assert collect(ours, tmp_path / "gone", tmp_path / "ours.sqlite", [tmp_path / "theirs.sqlite"]) == 8
+    one, other = (read_table(tmp_path / f"{name}.sqlite") for name in ("ours", "theirs"))
+    assert one.standing == other.standing[::-1]
+    assert (one.rows, one.versions, one.configs) == (other.rows, other.versions, other.configs)
+    (tmp_path / "theirs.sqlite").unlink()
+    before = (tmp_path / "ours.sqlite").read_bytes()
+    collect(ours, tmp_path / "gone", tmp_path / "ours.sqlite")
+    assert (tmp_path / "ours.sqlite").read_bytes() == before
 
 
 def test_an_episode_twice(finished, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ same bytes, so a committed table changes only where results do.
 import contextlib
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 from urllib.parse import quote
@@ -46,55 +46,102 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
                 yield row | {"cell": cell.id}
 
 
-def collect(grid: Grid, runs: Path, out: Path) -> int:
-    """Write the rows and the standing of a grid into a table. Returns the number of rows.
+def collect(grid: Grid, runs: Path, out: Path, others: Sequence[Path] = ()) -> int:
+    """Write the rows and the standing of a grid into a table.
+
+    Each cell is taken from where it has most rows: its run folders, the table that is there already, or another one, of
+    this grid from another machine or of a grid that shares the cell.
+
+    Args:
+        grid: the grid.
+        runs: the folder of its cells.
+        out: the table. It keeps cells whose run folders are gone.
+        others: more tables.
+
+    Returns:
+        The number of rows.
 
     Raises:
-        DelayRLError: no rows yet, a damaged run, a row that is there twice, `out` is the table of another grid.
+        DelayRLError: no rows yet, a damaged run or table, a row that is there twice, `out` is the table of another
+            grid or holds rows that the grid no longer has a cell for.
     """
-    before = 0
+    ids = {cell.id for cell in grid.cells}
+    held = {file: _cells_with_rows(file) for file in (*([out] if out.exists() else []), *others)}
     if out.exists():
         with _open(out) as table:
             name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
-            before = table.execute("SELECT COUNT(*) FROM rows").fetchone()[0]
         if name != grid.name:
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
-    if next(rows_of(grid.cells, runs), None) is None:
+        if gone := held[out].keys() - ids:
+            words = f"{out} has rows of cells that {grid.name} no longer has: {', '.join(sorted(gone))}"
+            raise DelayRLError(f"{words}; give another --out")
+    if not any(ids & cells.keys() for cells in held.values()) and next(rows_of(grid.cells, runs), None) is None:
         raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with draft(out, shared=True) as file, contextlib.closing(sqlite3.connect(file)) as table:
-            count = _fill(table, grid, runs)
-            if count < before:  # run folders are gone, or elsewhere
-                fewer = f"{out} has {before:,} rows, and below {runs} are only {count:,}"
-                raise DelayRLError(f"{fewer}; give another --out")
-            return count
+            return _fill(table, grid, runs, held)
     except (OSError, sqlite3.OperationalError) as error:
         raise DelayRLError(f"cannot write {out}: {error}") from error
 
 
-def _fill(table: sqlite3.Connection, grid: Grid, runs: Path) -> int:
+def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path, Mapping[str, int]]) -> int:
+    """Write the tables. `held` says how many rows other tables have of each cell. Returns the number of rows."""
     table.executescript("PRAGMA page_size = 4096; PRAGMA journal_mode = OFF;" + TABLES)
     meta = {"schema": str(SCHEMA), "grid": grid.name, "description": grid.description}
     table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
     count = 0
     for number, cell in enumerate(grid.cells):
-        p = progress(cell, runs)
-        values = (cell.id, number, _json(cell.json), p.state, p.step, p.speed)
-        table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", values)
-        later = _journal_versions(runs / cell.folder)
-        for path, seed in zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True):
-            count += _insert_run(table, cell, path, seed, later)
+        paths = zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
+        found = [(path, seed, name_configuration(RunFolder(path).read("rows"))) for path, seed in paths]
+        elsewhere = max(held, key=lambda file: held[file].get(cell.id, 0), default=None)
+        if elsewhere and held[elsewhere].get(cell.id, 0) > sum(len(rows) for *_, rows in found):
+            count += _copy_cell(table, elsewhere, cell, number)
+            continue
+        p, later = progress(cell, runs), _journal_versions(runs / cell.folder)
+        _insert_cell(table, cell, number, p)
+        count += sum(_insert_run(table, cell, path, seed, rows, later) for path, seed, rows in found if rows)
     table.commit()
     table.execute("VACUUM")
     return count
 
 
-def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, later: list[dict[str, Any]]) -> int:
-    """Insert a run and its rows, if it has any. Returns their number."""
-    rows = name_configuration(RunFolder(path).read("rows"))
-    if not rows:
-        return 0
+def _cells_with_rows(file: Path) -> dict[str, int]:
+    """Return how many rows a table has of each of its cells that have any."""
+    with _open(file) as table:
+        return dict(table.execute("SELECT cell, COUNT(*) FROM rows JOIN runs ON rows.run = runs.id GROUP BY cell"))
+
+
+def cells_done(file: Path) -> int:
+    """Return how many cells of a table are done."""
+    with _open(file) as table:
+        return int(table.execute("SELECT COUNT(*) FROM cells WHERE state = 'done'").fetchone()[0])
+
+
+def _insert_cell(table: sqlite3.Connection, cell: Cell, number: int, p: Progress) -> None:
+    values = (cell.id, number, _json(cell.json), p.state, p.step, p.speed)
+    table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", values)
+
+
+def _copy_cell(table: sqlite3.Connection, file: Path, cell: Cell, number: int) -> int:
+    """Copy a cell with its runs and rows out of another table. Returns the number of rows."""
+    with _open(file) as other:
+        stored = other.execute("SELECT state, step, steps_per_second FROM cells WHERE id = ?", (cell.id,)).fetchone()
+        query = "SELECT id, cell, seed, shared, config, versions FROM runs WHERE cell = ? ORDER BY id"
+        runs = other.execute(query, (cell.id,)).fetchall()
+        query = f"SELECT {', '.join(EPISODE)}, more FROM rows WHERE run = ?"
+        rows = [other.execute(query, (run,)).fetchall() for run, *_ in runs]
+    _insert_cell(table, cell, number, Progress(*stored))
+    for (_, *described), own in zip(runs, rows, strict=True):
+        run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", described).lastrowid
+        table.executemany("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", [(run, *row) for row in own])
+    return sum(map(len, rows))
+
+
+def _insert_run(
+    table: sqlite3.Connection, cell: Cell, path: Path, seed: int, rows: list[Row], later: list[dict[str, Any]]
+) -> int:
+    """Insert a run and its rows. Returns their number."""
     config = dict(RunFolder(path).config)
     first = config.pop("versions", None)
     versions = _distinct(([first] if first else []) + later)

@@ -51,6 +51,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--workers", type=whole, default=1, metavar="N", help="cells at a time, for the time left (default: 1)")
     add = add_command("collect", "write the rows of a grid into one SQLite table").add_argument
     add("--out", type=Path, help="the table (default: GRID.sqlite in the folder of the cells)")
+    words = "also take cells from this table: of another machine, or of a grid that shares them"
+    add("--also", type=Path, action="append", default=[], metavar="TABLE", help=words)
     add = add_command("report", "write tables, curves and one HTML page of the results so far").add_argument
     add("--out", type=Path, metavar="DIR", help="a folder (default: GRID-report in the folder of the cells)")
 
@@ -90,12 +92,11 @@ def _status(grid: Grid, given: argparse.Namespace) -> None:
 
 
 def _collect(grid: Grid, given: argparse.Namespace) -> None:
-    from delayrl.bench.results import collect
+    from delayrl.bench.results import cells_done, collect
 
     out = given.out or given.runs / f"{grid.name}.sqlite"
-    count = collect(grid, given.runs, out)
-    done = sum(status(cell, given.runs) == "done" for cell in grid.cells)
-    print(f"{out}: {count:,} rows; {done} of {len(grid.cells)} cells are done")
+    count = collect(grid, given.runs, out, given.also)
+    print(f"{out}: {count:,} rows; {cells_done(out)} of {len(grid.cells)} cells are done")
 
 
 def _report(grid: Grid | None, given: argparse.Namespace) -> None:
