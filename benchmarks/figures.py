@@ -321,13 +321,17 @@ def main() -> None:
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
-    if (HERE / "results" / "first.sqlite").exists():
-        delayrl(["bench", "report", str(HERE / "results" / "first.sqlite"), "--out", str(root / "docs" / "results")])
+    for name, folder in {"first": "", "evidence-1": "evidence-1"}.items():
+        if (rows := HERE / "results" / f"{name}.sqlite").exists():
+            delayrl(["bench", "report", str(rows), "--out", str(root / "docs" / "results" / folder)])
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
     if rows := sorted((HERE / "results").glob("any-age-*.sqlite"), reverse=True):
-        insert(root / "docs" / "algorithms" / "any-age.md", "ladder", ladder.section(rows, images / "ladder.png"))
+        arms, front = ladder.sections(rows, images)
+        insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
+        for page in ("README.md", "docs/index.md"):
+            insert(root / page, "halfcheetah", front)
     if forecast.OUT.exists():
         insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())
     if list((HERE / "results" / "times").glob("*.jsonl")):

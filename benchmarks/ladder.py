@@ -16,17 +16,36 @@ AWAY = 1_500
 BASE = "bpql"
 
 
-def section(files: list[Path], picture: Path) -> str:
-    """Draw the curves, and return the table with what made it."""
+FRONT = {"`sac`, no delay": "#8c8c8c", "`any-age`": "#1f6feb", "`bpql`": "#1a7f37"}
+"""The arms on the first page, and their colours."""
+
+
+def sections(files: list[Path], pictures: Path) -> tuple[str, str]:
+    """Draw the curves; return the table of all arms, and that of the first page, with what made them."""
     files_read, results = [read_table(file) for file in files], []
     for collected in files_read:
         cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
-    draw(learners, picture)
+    draw([(f"C{number % 10}", r) for number, r in enumerate(learners)], pictures / "ladder.png")
+    shown = [r for r in learners if name(r) in FRONT]
+    draw([(FRONT[name(r)], r) for r in shown], pictures / "halfcheetah.png")
     versions = files_read[0].versions[0]
     made = f"{versions['cores']} x86 cores, jax {versions['jax']}, MuJoCo {versions['mujoco']}"
-    return f"{table(learners)}\n\n{made}. Rows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
+    made += f". Rows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
+    return f"{table(learners)}\n\n{made}", f"{front(shown)}\n\nHalfCheetah-v5, preset `matched`; {made}"
+
+
+def front(results: list[Result]) -> str:
+    """Return the table of the first page."""
+    head = ["agent", "delay", "steps", "return at the end", "each seed", "GFLOP a step"]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    for result in results:
+        seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
+        cost = f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
+        cells = [f"`{result.condition.agent}`", str(result.place.delay), f"{result.condition.steps:,}"]
+        lines.append("| " + " | ".join([*cells, spread(result.curves.final), seeds, cost]) + " |")
+    return "\n".join(lines)
 
 
 def area(result: Result) -> statistics.Floats:
@@ -60,14 +79,13 @@ def table(results: list[Result]) -> str:
     return "\n".join(lines)
 
 
-def draw(results: list[Result], out: Path) -> None:
-    """Draw the curves of the arms in one picture."""
+def draw(arms: list[tuple[str, Result]], out: Path) -> None:
+    """Draw the curves of the arms, each in its colour, in one picture."""
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
-    for number, result in enumerate(results):
-        steps, returns = result.curves
-        curve(axes, steps, returns, f"C{number % 10}").set_label(name(result).replace("`", ""))
+    for colour, result in arms:
+        curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
     axes.set_title("HalfCheetah-v5, 25 steps late, five seeds")
-    axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in results]))))
+    axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for _, r in arms]))))
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)
