@@ -1,5 +1,6 @@
 """Rows of a grid and the published table: none lost, none twice, with the versions that made them."""
 
+import contextlib
 import json
 import shutil
 import sqlite3
@@ -13,12 +14,13 @@ from support import tiny
 import delayrl
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid
-from delayrl.bench.results import collect, read_table, rows_of, versions_of
+from delayrl.bench.results import cells_done, collect, read_table, rows_of, versions_of
 from delayrl.bench.status import standing, status
 from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
 from delayrl.run import provenance
 from delayrl.run.cell import Cell
+from delayrl.run.disk import lock
 from delayrl.run.folder import RunFolder
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -155,20 +157,21 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match="the table of the grid 'mixed'"):
         collect(Grid("other", "", grid.source, grid.cells), runs, file)
     before = file.read_bytes()
-    with pytest.raises(
-        delayrl.DelayRLError, match=rf"cells that mixed no longer has: {grid.cells[0].id}; give another"
-    ):
+    gone = rf"rows of 1 cell that mixed has no more \({grid.cells[0].id}\); give another --out, and --also"
+    with pytest.raises(delayrl.DelayRLError, match=gone):
         collect(replace(grid, cells=grid.cells[1:]), runs, file)
     assert file.read_bytes() == before
     with pytest.raises(delayrl.DelayRLError, match="there is no table"):
         collect(grid, runs, file, [tmp_path / "nowhere.sqlite"])
+    with pytest.raises(delayrl.DelayRLError, match="has no cell of mixed: it is the table of 'first'"):
+        collect(grid, runs, file, [BENCHMARKS / "results" / "first.sqlite"])
     with pytest.raises(delayrl.DelayRLError, match="has no rows"):
         collect(grid, tmp_path / "elsewhere", tmp_path / "none.sqlite")
     assert not (tmp_path / "none.sqlite").exists()
 
 
 def test_what_is_collected_stays(finished, tmp_path: Path) -> None:
-    """Where run folders are gone, or hold less, the table's own rows stay, to the last byte; more rows replace them."""
+    """Where run folders are gone, or hold less, the table's own cells stay, to the last byte."""
     grid, runs = finished
     file, part = tmp_path / "t.sqlite", tmp_path / "part"
     shutil.copytree(runs, part)
@@ -177,9 +180,53 @@ def test_what_is_collected_stays(finished, tmp_path: Path) -> None:
     assert collect(grid, part, file) == 6
     assert collect(grid, runs, file) == 8
     whole = file.read_bytes()
-    for folder in (part, tmp_path / "gone"):
+    for folder in (part, tmp_path / "gone", runs):
         assert collect(grid, folder, file) == 8
         assert file.read_bytes() == whole
+
+
+def changed(file: Path, query: str) -> Path:
+    """The table after a change, in a copy."""
+    copy = file.with_name(f"changed-{file.name}")
+    shutil.copy(file, copy)
+    with contextlib.closing(sqlite3.connect(copy)) as table:
+        table.execute(query)
+        table.commit()
+    return copy
+
+
+def test_of_equal_rows_those_that_have_ended_count(finished, tmp_path: Path) -> None:
+    """A cell that was running when it was collected is done once another table, or its run folder, says so."""
+    grid, runs = finished
+    file, gone = tmp_path / "t.sqlite", tmp_path / "gone"
+    collect(grid, runs, file)
+    whole = file.read_bytes()
+    for again in (lambda copy: collect(grid, runs, copy), lambda copy: collect(grid, gone, copy, [file])):
+        copy = changed(file, "UPDATE cells SET state = 'running' WHERE state = 'done'")
+        assert cells_done(copy) == 0
+        again(copy)
+        assert copy.read_bytes() == whole
+    copy = changed(file, "UPDATE cells SET state = 'failed', step = 30 WHERE state = 'todo'")
+    collect(grid, gone, copy)
+    assert [p.state for _, p in read_table(copy).standing] == ["done", "failed"]
+
+
+@pytest.mark.parametrize(
+    "query", ["DELETE FROM cells WHERE number = 0", "UPDATE cells SET state = 'well'", "UPDATE runs SET config = '{'"]
+)
+def test_a_damaged_table_replaces_nothing(finished, tmp_path: Path, query: str) -> None:
+    grid, runs = finished
+    out = tmp_path / "ours.sqlite"
+    collect(grid, runs, tmp_path / "t.sqlite")
+    with pytest.raises(delayrl.DelayRLError, match=r"changed-t\.sqlite (is no table of results, or|has no cell)"):
+        collect(replace(grid, cells=grid.cells[:1]), tmp_path / "gone", out, [changed(tmp_path / "t.sqlite", query)])
+    assert not out.exists()
+
+
+def test_only_one_collects_into_a_folder(finished, tmp_path: Path) -> None:
+    grid, runs = finished
+    with lock(tmp_path), pytest.raises(delayrl.DelayRLError, match="another program is collecting into"):
+        collect(grid, runs, tmp_path / "t.sqlite")
 
 
 def test_cells_of_other_tables(finished, tmp_path: Path) -> None:

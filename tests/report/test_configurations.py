@@ -58,7 +58,7 @@ def test_runs_that_differ_in_an_option_are_two_results(tmp_path: Path) -> None:
     assert finals(*one, *other) == {"bpql": [1.0, 2.0], "bpql discount=0.9": [30.0, 40.0]}
     summary = summary_of(*one, *other)
     assert [table.title for table in summary.tables if table.kind == "ablation"] == ["Ablation of bpql"]
-    assert summary.shared == {"bpql": {"steps": 300}}
+    assert summary.shared == {("bpql", ""): {"steps": 300}}
 
 
 def test_a_shorter_run_is_not_dropped(tmp_path: Path) -> None:

@@ -226,3 +226,27 @@ def test_hours_of_all_cells_of_a_result() -> None:
     assert "| 0.013 |" in markdown(summarise(every, cells), "t", {})
     cells[2] = parts[2]
     assert math.isnan(summarise(every, cells).results[place].hours)
+
+
+def test_overrides_of_a_task_do_not_part_an_agent() -> None:
+    """BPQL with fewer steps on Hopper is BPQL there too; what tells apart its cells on one task is in its labels."""
+    short = {"steps": 200, "overrides": {"steps": 200}}
+    cells = [
+        standing("bpql", "Ant-v4", 5, 2, steps=300),
+        standing("bpql", "Ant-v4", 5, 2, steps=300, overrides={"critic_norm": "layer"}),
+        standing("bpql", "Hopper-v4", 5, 2, **short),
+        standing("vdpo", "Ant-v4", 5, 2, steps=300),
+        standing("vdpo", "Hopper-v4", 5, 2, **short),
+    ]
+    every = [
+        r
+        for cell in cells
+        for seed in range(2)
+        for r in curve(cell, seed, [0, 0, 1][-cell[0].condition.steps // 100 :])
+    ]
+    summary = summarise(every, cells)
+    assert summary.labels == ["bpql", "bpql critic_norm=layer", "vdpo"]
+    assert summary.shared == {("bpql", "Hopper-v4"): {"steps": 200}, ("vdpo", "Hopper-v4"): {"steps": 200}}
+    assert "Overridden in all cells of bpql, vdpo on Hopper-v4: steps=200." in markdown(summary, "t", {})
+    (met,) = [c for c in summary.comparisons if (c.one, c.other) == ("bpql", "vdpo")]
+    assert met.tasks == 2

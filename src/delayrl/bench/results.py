@@ -18,7 +18,7 @@ from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell, CellState, Progress
-from delayrl.run.disk import draft
+from delayrl.run.disk import draft, lock
 from delayrl.run.folder import RunFolder
 from delayrl.run.rows import EPISODE, Row, name_configuration
 
@@ -46,10 +46,18 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
                 yield row | {"cell": cell.id}
 
 
+class Held(NamedTuple):
+    """What some place holds of a cell. The greatest is taken."""
+
+    rows: int = 0
+    done: bool = False
+    step: int = 0
+
+
 def collect(grid: Grid, runs: Path, out: Path, others: Sequence[Path] = ()) -> int:
     """Write the rows and the standing of a grid into a table.
 
-    Each cell is taken from where it has most rows: its run folders, the table that is there already, or another one, of
+    Each cell is taken from where most of it is: its run folders, the table that is there already, or another one, of
     this grid from another machine or of a grid that shares the cell.
 
     Args:
@@ -62,54 +70,68 @@ def collect(grid: Grid, runs: Path, out: Path, others: Sequence[Path] = ()) -> i
         The number of rows.
 
     Raises:
-        DelayRLError: no rows yet, a damaged run or table, a row that is there twice, `out` is the table of another
-            grid or holds rows that the grid no longer has a cell for.
+        DelayRLError: no rows yet, a damaged run or table, a row that is there twice, a table without a cell of the
+            grid, `out` is being written, is the table of another grid, or has rows of cells that the grid has no more.
     """
-    ids = {cell.id for cell in grid.cells}
-    held = {file: _cells_with_rows(file) for file in (*([out] if out.exists() else []), *others)}
-    if out.exists():
-        with _open(out) as table:
-            name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
-        if name != grid.name:
-            raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
-        if gone := held[out].keys() - ids:
-            words = f"{out} has rows of cells that {grid.name} no longer has: {', '.join(sorted(gone))}"
-            raise DelayRLError(f"{words}; give another --out")
-    if not any(ids & cells.keys() for cells in held.values()) and next(rows_of(grid.cells, runs), None) is None:
+    if not others and not out.exists() and next(rows_of(grid.cells, runs), None) is None:
         raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with draft(out, shared=True) as file, contextlib.closing(sqlite3.connect(file)) as table:
-            return _fill(table, grid, runs, held)
+        with lock(out.parent) as free:
+            if not free:
+                raise DelayRLError(f"another program is collecting into {out.parent}; try again when it has ended")
+            held = _held_elsewhere(grid, out, others)
+            with draft(out, shared=True) as file, contextlib.closing(sqlite3.connect(file)) as table:
+                return _fill(table, grid, runs, held)
     except (OSError, sqlite3.OperationalError) as error:
         raise DelayRLError(f"cannot write {out}: {error}") from error
 
 
-def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path, Mapping[str, int]]) -> int:
-    """Write the tables. `held` says how many rows other tables have of each cell. Returns the number of rows."""
+def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path, dict[str, Held]]:
+    """Return what the tables hold of each cell of the grid: the one that is there already, and others."""
+    ids, held = {cell.id for cell in grid.cells}, {}
+    for file in (*([out] if out.exists() else []), *others):
+        with _open(file) as table:
+            name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
+            cells = table.execute(
+                "SELECT cells.id, COUNT(rows.run), cells.state = 'done', cells.step FROM cells "
+                "LEFT JOIN runs ON runs.cell = cells.id LEFT JOIN rows ON rows.run = runs.id GROUP BY cells.id"
+            )
+            known = {id: Held(rows, bool(done), step) for id, rows, done, step in cells}
+        if file == out and name != grid.name:
+            raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
+        gone = sorted(id for id, of in known.items() if of.rows and id not in ids)
+        if file == out and gone:
+            number = "1 cell" if len(gone) == 1 else f"{len(gone)} cells"
+            words = f"{out} has rows of {number} that {grid.name} has no more ({', '.join(gone[:3])}"
+            words += ", …)" if gone[3:] else ")"
+            raise DelayRLError(f"{words}; give another --out, and --also {out} for the cells that it still has")
+        held[file] = {id: known[id] for id in ids & known.keys()}
+        if not held[file]:
+            raise DelayRLError(f"{file} has no cell of {grid.name}: it is the table of {name!r}")
+    return held
+
+
+def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path, Mapping[str, Held]]) -> int:
+    """Write the tables. `held` says what other tables hold of each cell. Returns the number of rows."""
     table.executescript("PRAGMA page_size = 4096; PRAGMA journal_mode = OFF;" + TABLES)
     meta = {"schema": str(SCHEMA), "grid": grid.name, "description": grid.description}
     table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
     count = 0
     for number, cell in enumerate(grid.cells):
+        p, later = progress(cell, runs), _journal_versions(runs / cell.folder)  # before the rows, which may be more
         paths = zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
         found = [(path, seed, name_configuration(RunFolder(path).read("rows"))) for path, seed in paths]
-        elsewhere = max(held, key=lambda file: held[file].get(cell.id, 0), default=None)
-        if elsewhere and held[elsewhere].get(cell.id, 0) > sum(len(rows) for *_, rows in found):
+        here = Held(sum(len(rows) for *_, rows in found), p.state == "done", p.step)
+        elsewhere = max(held, key=lambda file: held[file].get(cell.id, Held()), default=None)
+        if elsewhere and held[elsewhere].get(cell.id, Held()) > here:
             count += _copy_cell(table, elsewhere, cell, number)
             continue
-        p, later = progress(cell, runs), _journal_versions(runs / cell.folder)
         _insert_cell(table, cell, number, p)
         count += sum(_insert_run(table, cell, path, seed, rows, later) for path, seed, rows in found if rows)
     table.commit()
     table.execute("VACUUM")
     return count
-
-
-def _cells_with_rows(file: Path) -> dict[str, int]:
-    """Return how many rows a table has of each of its cells that have any."""
-    with _open(file) as table:
-        return dict(table.execute("SELECT cell, COUNT(*) FROM rows JOIN runs ON rows.run = runs.id GROUP BY cell"))
 
 
 def cells_done(file: Path) -> int:
@@ -126,12 +148,18 @@ def _insert_cell(table: sqlite3.Connection, cell: Cell, number: int, p: Progress
 def _copy_cell(table: sqlite3.Connection, file: Path, cell: Cell, number: int) -> int:
     """Copy a cell with its runs and rows out of another table. Returns the number of rows."""
     with _open(file) as other:
-        stored = other.execute("SELECT state, step, steps_per_second FROM cells WHERE id = ?", (cell.id,)).fetchone()
+        query = "SELECT id, cell, state, step, steps_per_second FROM cells WHERE id = ?"
+        _, p = _stored_cell(*other.execute(query, (cell.id,)).fetchone())
         query = "SELECT id, cell, seed, shared, config, versions FROM runs WHERE cell = ? ORDER BY id"
         runs = other.execute(query, (cell.id,)).fetchall()
         query = f"SELECT {', '.join(EPISODE)}, more FROM rows WHERE run = ?"
         rows = [other.execute(query, (run,)).fetchall() for run, *_ in runs]
-    _insert_cell(table, cell, number, Progress(*stored))
+        for text in (
+            *(text for *_, a, b, c in runs for text in (a, b, c)),
+            *(more for own in rows for *_, more in own),
+        ):
+            json.loads(text or "{}")  # what cannot be read must not replace what can
+    _insert_cell(table, cell, number, p)
     for (_, *described), own in zip(runs, rows, strict=True):
         run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", described).lastrowid
         table.executemany("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", [(run, *row) for row in own])

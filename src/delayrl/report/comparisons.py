@@ -29,7 +29,8 @@ class Comparison(NamedTuple):
     other: str
     probability: Estimate  # that a run of `one` ends above one of `other` on the same task: mean over tasks
     difference: Estimate  # of their mean normalised final returns, NaN without anchors
-    tasks: int  # over all constant delays each task counts with each delay
+    tasks: int  # that both have ended on; over all constant delays each counts with each delay
+    runs: tuple[int, int]  # of either
 
     @property
     def clear(self) -> bool:
@@ -38,38 +39,33 @@ class Comparison(NamedTuple):
 
     def turned(self) -> Self:
         """Return the same from the other's side."""
-        (p, p_low, p_high), (d, d_low, d_high) = self.probability, self.difference
-        turned = Estimate(1 - p, 1 - p_high, 1 - p_low), Estimate(-d, -d_high, -d_low)
-        return self._replace(one=self.other, other=self.one, probability=turned[0], difference=turned[1])
+        p, d, (one, other) = self.probability, self.difference, self.runs
+        chance, apart = Estimate(1 - p.value, 1 - p.high, 1 - p.low), Estimate(-d.value, -d.high, -d.low)
+        return self._replace(one=self.other, other=self.one, probability=chance, difference=apart, runs=(other, one))
 
 
 Pair = tuple[Result, Result]
 
 
 def make_comparisons(results: Iterable[Result]) -> list[Comparison]:
-    """Compare each two learners whose seeds have ended, in the order of their labels."""
+    """Compare each two learners, by their seeds that have ended, in the order of their labels."""
     ended: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
     for result in results:
         if not result.is_anchor and not result.partial and result.runs:
             ended[result.place.setting, result.place.delay].append(result)
             if isinstance(result.place.delay, int):
                 ended[result.place.setting, None].append(result)
-    delays = {
-        setting: {delay for of, delay in ended if of == setting and isinstance(delay, int)} for setting, _ in ended
-    }
     comparisons = []
     for setting, delay in sorted(ended, key=lambda key: (key[0], key[1] is None, delay_order(key[1] or 0))):
-        if delay is None and len(delays[setting]) < 2:
-            continue
         at: dict[str, dict[object, Result]] = defaultdict(dict)
         for result in ended[setting, delay]:
             at[result.place.label][result.place.env, result.place.delay, result.condition.steps] = result
         for one, other in combinations(sorted(at, key=agent_order), 2):
             pairs = [(result, at[other][key]) for key, result in at[one].items() if key in at[other]]
-            if pairs:
-                comparisons.append(
-                    Comparison(setting, delay, one, other, _probability(pairs), _difference(pairs), len(pairs))
-                )
+            if len({pair[0].place.delay for pair in pairs}) >= (2 if delay is None else 1):
+                runs = sum(pair[0].runs for pair in pairs), sum(pair[1].runs for pair in pairs)
+                estimates = _probability(pairs), _difference(pairs)
+                comparisons.append(Comparison(setting, delay, one, other, *estimates, len(pairs), runs))
     return comparisons
 
 

@@ -102,9 +102,12 @@ def _comparisons(summary: Summary, comparisons: Sequence[Comparison]) -> str:
             line = ["all constant" if delay is None else _escape(delay), _escape(summary.name(one))]
             for other in labels:
                 c = at.get((delay, one, other))
-                p, within, difference = wording.comparison_texts(c) if c else ("", "", "")
-                p, difference = f"**{p}**" if c and c.clear else p, GREY.format(difference) if difference else ""
-                parts = [p, within, difference]
+                p, *more = wording.comparison_texts(c) if c else ("",)
+                parts = [
+                    f"**{p}**" if c and c.clear else p,
+                    *more[:1],
+                    *(GREY.format(text) for text in more[1:] if text),
+                ]
                 line.append("<br>".join(part for part in parts if part))
             body.append(line)
     return _table(["Δ", "Agent", *(f"over {_escape(summary.name(label))}" for label in labels)], body)

@@ -82,7 +82,7 @@ class Result:
     privileged: bool  # whether its behaviour reads the true state while it trains
     curves: Curves  # of the complete seeds; where there is none yet, of all
     cost: Cost | None = None  # of learning, where its runs say so
-    hours: float = NAN  # that its cells took, added up; NaN where a speed is unknown
+    hours: float = NAN  # of its cells, at the speed since their last start; NaN where it is unknown
     options_known: bool = True  # whether a grid or the configurations of all its runs say its options
     random_anchor: Anchor = NO_ANCHOR  # its returns are normalised by this
     reference_anchor: Anchor = NO_ANCHOR  # and by this

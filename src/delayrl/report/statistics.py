@@ -19,6 +19,8 @@ SMOOTHED = 5
 """Evaluations that a smoothed curve averages."""
 REPETITIONS = 2000
 PERCENTILES = (2.5, 97.5)
+FEWEST = 5
+"""Runs of either of two agents, below which an interval of which is better would mislead."""
 
 
 class Stratum(NamedTuple):
@@ -154,9 +156,9 @@ def improvement_interval(
         seed: the same returns and seed give the same interval.
 
     Returns:
-        Lower and upper bound; NaN with fewer than two runs of either on a task.
+        Lower and upper bound; NaN with fewer than FEWEST runs of either on a task.
     """
-    if min(x.size for pair in pairs for x in pair) < 2:
+    if min(x.size for pair in pairs for x in pair) < FEWEST:
         return NAN, NAN
     random = np.random.default_rng(seed)
     resampled = [[_resample(random, x, repetitions) for x in pair] for pair in pairs]

@@ -42,7 +42,7 @@ class Summary:
     """Results, tables, aggregates and comparisons."""
 
     results: dict[Place, Result]  # in the order of their places
-    shared: dict[str, Mapping[str, Any]]  # overrides that all cells of an agent have, by agent
+    shared: dict[tuple[str, str], Mapping[str, Any]]  # overrides of all cells of an agent, or of those of one task
     tables: list[Table]
     aggregates: list[Aggregate]
     comparisons: list[Comparison]
@@ -130,22 +130,33 @@ def _place_groups(groups: Iterable[RowGroup], cells: Iterable[Cell]) -> tuple[in
     return unplaced, placed
 
 
-def _label_cells(cells: Iterable[Cell]) -> tuple[dict[str, str], dict[str, Mapping[str, Any]]]:
-    """Label each cell with its agent and the overrides that not all its cells share; return the shared ones too."""
-    cells_of: dict[str, list[Cell]] = defaultdict(list)
+def _label_cells(cells: Iterable[Cell]) -> tuple[dict[str, str], dict[tuple[str, str], Mapping[str, Any]]]:
+    """Label each cell with its agent and the overrides that tell apart the agent's cells of one task.
+
+    Returns the other overrides too: of all cells of an agent, by (agent, ""), and of those of a task, by (agent, task).
+    """
+    cells_of: dict[str, dict[str, list[Cell]]] = defaultdict(lambda: defaultdict(list))
     for cell in cells:
-        cells_of[cell.condition.agent].append(cell)
+        cells_of[cell.condition.agent][cell.condition.env].append(cell)
     labels: dict[str, str] = {}
-    shared: dict[str, Mapping[str, Any]] = {}
-    for agent, group in cells_of.items():
-        overrides = [cell.condition.overrides for cell in group]
-        same = {k: v for k, v in overrides[0].items() if all(k in other and other[k] == v for other in overrides)}
-        if same:
-            shared[agent] = same
+    shared: dict[tuple[str, str], Mapping[str, Any]] = {}
+    for agent, of_task in cells_of.items():
+        group = [cell for some in of_task.values() for cell in some]
+        telling = {name for some in of_task.values() for name in _differing(some)}
+        for env, some in {"": group, **of_task}.items():
+            known = shared.get((agent, ""), {}).keys() | telling | (set() if env else _differing(group))
+            if own := {k: v for k, v in some[0].condition.overrides.items() if k not in known}:
+                shared[agent, env] = own
         for cell in group:
-            own = [f"{k}={v}" for k, v in sorted(cell.condition.overrides.items()) if k not in same]
-            labels[cell.id] = " ".join([agent, *own])
+            words = [f"{k}={v}" for k, v in sorted(cell.condition.overrides.items()) if k in telling]
+            labels[cell.id] = " ".join([agent, *words])
     return labels, shared
+
+
+def _differing(cells: Sequence[Cell]) -> set[str]:
+    """Return the overrides that not all cells have alike."""
+    first, *others = (cell.condition.overrides for cell in cells)
+    return {k for other in others for k in {*first, *other} if (k in first, first.get(k)) != (k in other, other.get(k))}
 
 
 def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:

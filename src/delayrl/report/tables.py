@@ -103,14 +103,14 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], resul
     conditions = {place.label: result.condition for place, result in results.items()}
     entries = {}
     for (env, delay), label in product(rows, columns):
-        overrides = conditions[label].overrides if label in conditions else {}
-        agent = conditions[label].agent if label in conditions else label
+        result = results.get(Place(setting, env, delay, label))
+        condition = result.condition if result else conditions.get(label)
+        overrides, agent = (condition.overrides, condition.agent) if condition else ({}, label)
         representation = str(overrides.get("representation", "transformer"))
         if kind != "ablation" and representation == "transformer":
             representation = ""  # only values of the ablation name one
         measure = "steps" if kind == "steps" else "normalised"
         key = (measure, env.removeprefix("delayrl/"), str(delay), agent, representation)
-        result = results.get(Place(setting, env, delay, label))
         same = overrides.keys() <= SAME_RUN and (result is None or _is_whole(result))  # the paper ran no other variants
         entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None)
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Anchor, Result, Setting, agent_order
-from delayrl.report.statistics import SMOOTHED, mean_std
+from delayrl.report.statistics import FEWEST, SMOOTHED, mean_std
 from delayrl.report.summary import Summary
 from delayrl.report.tables import Table, TableEntry
 from delayrl.run.cost import Cost
@@ -102,27 +102,34 @@ def caption(table: Table) -> str:
 
 
 CELLS_CAPTION = (
-    "Returns after the last step. Hours: of one worker, on a CPU one core, for all seeds together; as long as it took "
-    "beside whatever else the machine did."
+    "Returns after the last step. Hours: of one worker, on a CPU one core, for all seeds together, at the speed since "
+    "its last start, beside whatever else the machine did."
 )
 COMPARISON_CAPTION = (
     "How probable it is that a run of the row's agent ends above one of the column's on the same task: mean over tasks "
-    "that both have ended on, 95 % interval by bootstrap over runs within their task, bold where it excludes 0.5. "
-    "Below it, the difference of their mean normalised returns, with the anchors' uncertainty."
+    "that both have ended on, 95 % interval by bootstrap over runs within their task, bold where it excludes 0.5; "
+    f"none with fewer than {FEWEST} runs of either. Below it, the difference of their mean normalised returns, where "
+    "all these tasks have anchors, with the anchors' uncertainty. Of many comparisons some are bold by chance."
 )
 
 
-def comparison_texts(comparison: Comparison) -> tuple[str, str, str]:
-    """Write the probability, its interval, and the difference of normalised returns with its own."""
+def comparison_texts(comparison: Comparison) -> tuple[str, str, str, str]:
+    """Write the probability, its interval, the difference of normalised returns with its own, and what they rest on."""
     p, d = comparison.probability, comparison.difference
     within = interval((d.low, d.high), signed)
     difference = "" if math.isnan(d.value) else signed(d.value) + (f" ({within})" if within else "")
-    return normalised(p.value), interval((p.low, p.high), normalised), difference
+    one, other = comparison.runs
+    counts = (
+        f"{count(comparison.tasks, 'task' if comparison.delay is not None else 'condition')}, {one} and {other} runs"
+    )
+    return normalised(p.value), interval((p.low, p.high), normalised), difference, counts
 
 
 def hours(value: float) -> str:
     """Write hours with two digits or more; empty if they are unknown."""
-    return "" if math.isnan(value) else f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+    if math.isnan(value) or value < 0.01:
+        return "" if math.isnan(value) else "< 0.01"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def signed(value: float) -> str:
@@ -194,11 +201,15 @@ def states(summary: Summary) -> str:
 
 
 def overrides(summary: Summary) -> list[str]:
-    """Write the overrides that all cells of an agent share, a sentence for agents that agree."""
-    agents_with: dict[str, list[str]] = {}
-    for agent, values in summary.shared.items():
-        agents_with.setdefault(", ".join(f"{k}={v}" for k, v in sorted(values.items())), []).append(agent)
-    return [f"Overridden in all cells of {', '.join(sorted(a))}: {values}." for values, a in agents_with.items()]
+    """Write the overrides that all cells of an agent share, or all of a task, a sentence for agents that agree."""
+    agents_with: dict[tuple[str, str], list[str]] = {}
+    for (agent, env), values in summary.shared.items():
+        words = f" on {env}" if env else ""
+        agents_with.setdefault((words, ", ".join(f"{k}={v}" for k, v in sorted(values.items()))), []).append(agent)
+    return [
+        f"Overridden in all cells of {', '.join(sorted(agents))}{words}: {values}."
+        for (words, values), agents in agents_with.items()
+    ]
 
 
 def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:
