@@ -4,6 +4,11 @@ Paper: Bhatt et al., ICLR 2024. Batch norm before every layer of the critics tak
 are no target critics: one pass over (s_t, a_t) and (s_{t+k}, a') gives values and targets, both normalised by the
 moments of their mixture. Where only values are wanted, running moments take the place of the batch's.
 
+One thing changes in the ladder, so the rest stays any-age's and is not CrossQ's: critics of the preset's width (there
+2048), no batch norm in the actor, Adam's usual moments (there β1 = 0.5), k-step targets, as many steps of the actor as
+of the critics (there a third). Its released code turns batch norm into renormalisation after 100,000 updates, which a
+run of the ladder does not reach.
+
 Run it in this folder: `delayrl bench run any-age-crossq.toml`.
 """
 
@@ -20,7 +25,7 @@ from delayrl.agents.base import descend
 from delayrl.agents.registry import AGENTS, Preset, Registration
 from delayrl.agents.sac import SAC, ImproveActor, State
 from delayrl.core import networks
-from delayrl.core.networks import Params
+from delayrl.core.networks import Norm, Params
 from delayrl.core.objectives import k_step_return, soft_target, soft_value
 from delayrl.core.types import Key, Metrics, Spec, Window
 
@@ -71,6 +76,8 @@ def folded(critic: Params, running: list[Moments]) -> Params:
 class CrossQ(SAC):
     """SAC with CrossQ's critics. The place of the target critics in the state holds the running moments."""
 
+    critic_norm: Annotated[Norm, "fixed"] = "none"
+    target_rate: Annotated[float, "fixed"] = 0.0
     momentum: Annotated[float, "rate at which the running moments stay as they are", (0.0, 1.0)] = 0.99
 
     def init(self, spec: Spec, key: Key) -> State:
@@ -143,8 +150,9 @@ class CrossQ(SAC):
 def _with_crossq(preset: Preset) -> Preset:
     agent = preset.agent
     assert isinstance(agent, AnyAge)
-    sac = {field.name: getattr(agent.bpql, field.name) for field in fields(SAC)}
-    return preset._replace(agent=replace(agent, bpql=CrossQ(**(sac | {"critic_norm": "none"}))))
+    ours = {field.name for field in fields(SAC)} - {"critic_norm", "target_rate"}
+    sac = {name: getattr(agent.bpql, name) for name in ours}
+    return preset._replace(agent=replace(agent, bpql=CrossQ(**sac)))
 
 
 ANY_AGE = Registration(

@@ -327,7 +327,8 @@ def main() -> None:
     if list((HERE / "results" / "learning").glob("*.jsonl")):
         text = learning.section(HERE / "results" / "learning", images / "learning.png")
         insert(root / "docs" / "benchmarks.md", "learning", text)
-    if rows := sorted((HERE / "results").glob("any-age-*.sqlite"), reverse=True):
+    rows = [HERE / "results" / f"{name}.sqlite" for name in ("any-age-ladder", "any-age-crossq")]
+    if rows := [file for file in rows if file.exists()]:
         arms, front = ladder.sections(rows, images)
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
         for page in ("README.md", "docs/index.md"):

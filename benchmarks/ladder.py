@@ -30,9 +30,11 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str]:
     draw([(f"C{number % 10}", r) for number, r in enumerate(learners)], pictures / "ladder.png")
     shown = [r for r in learners if name(r) in FRONT]
     draw([(FRONT[name(r)], r) for r in shown], pictures / "halfcheetah.png")
-    versions = files_read[0].versions[0]
-    made = f"{versions['cores']} x86 cores, jax {versions['jax']}, MuJoCo {versions['mujoco']}"
-    made += f". Rows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
+    every = [used for collected in files_read for used in collected.versions]
+    words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
+    made = (
+        "; ".join(dict.fromkeys(words)) + f". Rows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
+    )
     return f"{table(learners)}\n\n{made}", f"{front(shown)}\n\nHalfCheetah-v5, preset `matched`; {made}"
 
 
@@ -84,7 +86,7 @@ def draw(arms: list[tuple[str, Result]], out: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
     for colour, result in arms:
         curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
-    axes.set_title("HalfCheetah-v5, 25 steps late, five seeds")
+    axes.set_title("HalfCheetah-v5, 25 steps late unless said, five seeds")
     axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for _, r in arms]))))
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(out, dpi=130)

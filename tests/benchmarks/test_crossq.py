@@ -96,6 +96,10 @@ def test_update_by_hand(windows: Window) -> None:
     expected = optax.apply_updates(state.critic, change)
     for ours, theirs in zip(jax.tree.leaves(after.critic), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=2e-5)
+    for ours, theirs in zip(
+        jax.tree.leaves(after.critic_opt_state[0].mu), jax.tree.leaves(gradient), strict=True
+    ):  # a step of Adam alone would show signs
+        np.testing.assert_allclose(ours, 0.1 * theirs, rtol=2e-3, atol=1e-5)
     moments = crossq.in_training(state.critic[1], jnp.asarray(both))[1]
     np.testing.assert_allclose(after.target[1][0].mean, 0.1 * moments[0].mean, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(after.target[1][2].variance, 0.9 + 0.1 * moments[2].variance, rtol=1e-4)
@@ -120,7 +124,7 @@ def test_it_trains_as_any_age_with_other_critics(tmp_path: Path) -> None:
     plain = delayrl.agents.registry.AGENTS["any-age"].presets["matched"].agent
     agent = crossq.ANY_AGE.presets["matched"].agent
     differing = {f: (getattr(plain.bpql, f), getattr(agent.bpql, f)) for f in plain.bpql.__dataclass_fields__}
-    assert {name for name, (a, b) in differing.items() if a != b} == {"critic_norm"}
+    assert {name for name, (a, b) in differing.items() if a != b} == {"critic_norm", "target_rate"}
     run = delayrl.train(
         "crossq:ANY_AGE", "Reacher-v5", 3, preset="small", hidden=[8, 8], batch_size=8, steps=120, random_steps=100,
         evaluate_every=120, evaluation_episodes=1, progress=False, out=tmp_path / "run",

@@ -236,6 +236,8 @@ def test_gradients_of_layer_norm(shape: tuple[int, ...]) -> None:
         return jax.grad(lambda a, b, x: jnp.sin(norm({"scale": a, "shift": b}, x)).sum(), (0, 1, 2))
 
     params = {"scale": scale, "shift": shift}
+    program = str(jax.make_jaxpr(gradients(networks.layer_norm))(scale, shift, x))
+    assert program.count("dot_general[") == program.count("HIGHEST, Precision.HIGHEST") > 0  # or a GPU would round them
     np.testing.assert_allclose(networks.layer_norm(params, x), formula(params, x), rtol=1e-4, atol=1e-5)
     expected = gradients(formula)(scale, shift, x)
     alone = gradients(networks.layer_norm)(scale, shift, x)
