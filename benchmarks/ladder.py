@@ -40,13 +40,13 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str]:
 
 def front(results: list[Result]) -> str:
     """Return the table of the first page."""
-    head = ["agent", "delay", "steps", "return at the end", "each seed", "GFLOP a step"]
+    head = ["agent", "delay", "return at the end", "each seed", "steps", "GFLOP a step"]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for result in results:
         seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
         cost = f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
-        cells = [f"`{result.condition.agent}`", str(result.place.delay), f"{result.condition.steps:,}"]
-        lines.append("| " + " | ".join([*cells, spread(result.curves.final), seeds, cost]) + " |")
+        cells = [f"`{result.condition.agent}`", str(result.place.delay), spread(result.curves.final), seeds]
+        lines.append("| " + " | ".join([*cells, f"{result.condition.steps:,}", cost]) + " |")
     return "\n".join(lines)
 
 
