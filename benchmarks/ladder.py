@@ -41,13 +41,22 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str]:
 def front(results: list[Result]) -> str:
     """Return the table of the first page."""
     head = ["agent", "delay", "return at the end", "each seed", "steps", "GFLOP a step"]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    body = []
     for result in results:
         seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
-        cost = f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
         cells = [f"`{result.condition.agent}`", str(result.place.delay), spread(result.curves.final), seeds]
-        lines.append("| " + " | ".join([*cells, f"{result.condition.steps:,}", cost]) + " |")
-    return "\n".join(lines)
+        body.append([*cells, f"{result.condition.steps:,}", gflop(result)])
+    return written(head, body)
+
+
+def gflop(result: Result) -> str:
+    """Write the arithmetic of a step; empty if it is unknown."""
+    return f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
+
+
+def written(head: list[str], body: list[list[str]]) -> str:
+    """Write a table in Markdown."""
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
 
 
 def area(result: Result) -> statistics.Floats:
@@ -69,16 +78,15 @@ def table(results: list[Result]) -> str:
     base = next((area(r) for r in results if name(r) == f"`{BASE}`"), None)
     head = ["arm", "seeds", "mean return over training", "times BPQL's", "difference, 95 % interval", "at the end"]
     head += [f"seeds above {AWAY:,}", "GFLOP a step"]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    body = []
     for result in results:
         own, final = area(result), result.curves.final
         compared = base is not None and name(result) != f"`{BASE}`"
         times = f"{own.mean() / base.mean():.2f}" if compared and base is not None else ""
         apart = difference(own, base) if compared else ""
         cells = [name(result), str(result.runs), spread(own), times, apart, spread(final)]
-        cost = f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
-        lines.append("| " + " | ".join([*cells, f"{int((final > AWAY).sum())} of {final.size}", cost]) + " |")
-    return "\n".join(lines)
+        body.append([*cells, f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
+    return written(head, body)
 
 
 def draw(arms: list[tuple[str, Result]], out: Path) -> None:

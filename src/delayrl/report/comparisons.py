@@ -8,8 +8,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from delayrl.report import statistics
-from delayrl.report.results import Result, Setting, agent_order, delay_order
-from delayrl.report.statistics import NAN, Floats, Stratum
+from delayrl.report.results import Result, Setting, agent_order, delay_order, make_strata
+from delayrl.report.statistics import NAN
 
 
 class Estimate(NamedTuple):
@@ -79,13 +79,11 @@ def _difference(pairs: Sequence[Pair]) -> Estimate:
     value = float(np.mean([one.final.mean() - other.final.mean() for one, other in pairs]))
     if np.isnan(value):
         return Estimate(NAN)
-    strata: dict[object, Stratum] = {}  # one for each task and length: its conditions share their anchors
-    weights: dict[object, list[Floats]] = defaultdict(list)
-    for one, other in pairs:
-        key, (random, reference, _) = (one.place.env, one.condition.steps), one.stratum
-        finals = [one.curves.final, other.curves.final]
-        strata[key] = Stratum(random, reference, [*(strata[key].returns if key in strata else ()), *finals])
-        weights[key] += [np.full(x.size, sign / x.size / len(pairs)) for x, sign in zip(finals, (1, -1), strict=True)]
-    weight = np.concatenate([part for parts in weights.values() for part in parts])
-    low, high = statistics.stratified_bootstrap([*strata.values()], lambda scores: scores @ weight)
+    # one pair after the other, those of one task and length together, as their strata are
+    pairs = sorted(pairs, key=lambda pair: (pair[0].place.env, pair[0].condition.steps))
+    weights = [
+        np.full(r.runs, sign / r.runs / len(pairs)) for pair in pairs for r, sign in zip(pair, (1, -1), strict=True)
+    ]
+    weight, strata = np.concatenate(weights), make_strata(result for pair in pairs for result in pair)
+    low, high = statistics.stratified_bootstrap(strata, lambda scores: scores @ weight)
     return Estimate(value, float(low), float(high))

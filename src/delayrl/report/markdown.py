@@ -78,15 +78,14 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
     labels = sorted({a.label for a in aggregates}, key=agent_order)
     body = []
     for delay in dict.fromkeys(a.delay for a in aggregates):
-        line = ["all constant" if delay is None else _escape(delay)]
+        line = [_escape(wording.delay(delay))]
         for label in labels:
             a = by_place.get((delay, label))
             if a is None:
                 line.append("")
                 continue
             interval = "" if math.isnan(a.low) else f"<br>{a.low:.2f} to {a.high:.2f}"
-            tasks = wording.count(a.tasks, "condition" if delay is None else "task")
-            counts = GREY.format(f"{tasks}, {wording.count(a.runs, 'run')}")
+            counts = GREY.format(f"{wording.tasks(a.tasks, delay)}, {wording.count(a.runs, 'run')}")
             line.append(f"**{a.iqm:.2f}**{interval}<br>{counts}")
         body.append(line)
     return _table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
@@ -99,7 +98,7 @@ def _comparisons(summary: Summary, comparisons: Sequence[Comparison]) -> str:
         for one in labels:
             if not any((delay, one, other) in at for other in labels):
                 continue
-            line = ["all constant" if delay is None else _escape(delay), _escape(summary.name(one))]
+            line = [_escape(wording.delay(delay)), _escape(summary.name(one))]
             for other in labels:
                 c = at.get((delay, one, other))
                 p, *more = wording.comparison_texts(c) if c else ("",)

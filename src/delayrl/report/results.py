@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -227,6 +227,14 @@ def _result(place: Place, standing: Standing, group_of: Mapping[str, RowGroup], 
         _hours(progress),
         not inferred or all(group.config for group in groups),
     )
+
+
+def make_strata(results: Iterable[Result]) -> list[Stratum]:
+    """Put results that share their anchors into one stratum: those of one task and length."""
+    strata: dict[tuple[str, int], list[Stratum]] = defaultdict(list)
+    for result in results:
+        strata[result.place.env, result.condition.steps].append(result.stratum)
+    return [Stratum(*some[0][:2], [x for one in some for x in one.returns]) for some in strata.values()]
 
 
 def _hours(progress: Sequence[Progress]) -> float:

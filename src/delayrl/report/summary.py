@@ -11,9 +11,9 @@ from delayrl.errors import DelayRLError
 from delayrl.report import statistics
 from delayrl.report.comparisons import Comparison, make_comparisons
 from delayrl.report.configurations import by_key, distinct_overrides
-from delayrl.report.results import Place, Result, Setting, agent_order, delay_order, make_results
+from delayrl.report.results import Place, Result, Setting, agent_order, delay_order, make_results, make_strata
 from delayrl.report.rows import RowGroup, group_rows
-from delayrl.report.statistics import Floats, Stratum
+from delayrl.report.statistics import Floats
 from delayrl.report.tables import Table, make_tables
 from delayrl.run.cell import Cell, Progress, Standing
 
@@ -176,20 +176,12 @@ def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
 
 def _aggregate(setting: Setting, delay: int | str | None, label: str, results: list[Result]) -> Aggregate:
     pooled = np.concatenate([result.final for result in results])
-    strata = _strata(results)
+    strata = make_strata(results)
     iqm = float(statistics.interquartile_mean(pooled))
     low, high = statistics.stratified_bootstrap(strata, statistics.interquartile_mean)
     profile = statistics.performance_profile(pooled, THRESHOLDS)
     band = statistics.stratified_bootstrap(strata, lambda x: statistics.performance_profile(x, THRESHOLDS), 500)
     return Aggregate(setting, delay, label, iqm, float(low), float(high), len(results), pooled.size, profile, *band)
-
-
-def _strata(results: Iterable[Result]) -> list[Stratum]:
-    """Put results that share their anchors into one stratum: those of one task and length."""
-    strata: dict[tuple[str, int], list[Stratum]] = defaultdict(list)
-    for result in results:
-        strata[result.place.env, result.condition.steps].append(result.stratum)
-    return [Stratum(*some[0][:2], [x for one in some for x in one.returns]) for some in strata.values()]
 
 
 def _order(aggregate: Aggregate) -> tuple[Any, ...]:

@@ -119,17 +119,25 @@ def comparison_texts(comparison: Comparison) -> tuple[str, str, str, str]:
     within = interval((d.low, d.high), signed)
     difference = "" if math.isnan(d.value) else signed(d.value) + (f" ({within})" if within else "")
     one, other = comparison.runs
-    counts = (
-        f"{count(comparison.tasks, 'task' if comparison.delay is not None else 'condition')}, {one} and {other} runs"
-    )
+    counts = f"{tasks(comparison.tasks, comparison.delay)}, {one} and {other} runs"
     return normalised(p.value), interval((p.low, p.high), normalised), difference, counts
+
+
+def tasks(number: int, delay: int | str | None) -> str:
+    """Write a number of tasks at a delay, or of conditions at all constant ones."""
+    return count(number, "condition" if delay is None else "task")
+
+
+def delay(delay: int | str | None) -> str:
+    """Write a delay, or that all constant ones are together."""
+    return "all constant" if delay is None else str(delay)
 
 
 def hours(value: float) -> str:
     """Write hours with two digits or more; empty if they are unknown."""
-    if math.isnan(value) or value < 0.01:
-        return "" if math.isnan(value) else "< 0.01"
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+    if math.isnan(value):
+        return ""
+    return "< 0.01" if value < 0.01 else f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def signed(value: float) -> str:
