@@ -20,7 +20,7 @@ SMOOTHED = 5
 REPETITIONS = 2000
 PERCENTILES = (2.5, 97.5)
 FEWEST = 5
-"""Runs of either of two agents, below which an interval of which is better would mislead."""
+"""With fewer runs of either of two agents, an interval of which is better would mislead."""
 
 
 class Stratum(NamedTuple):

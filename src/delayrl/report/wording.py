@@ -106,10 +106,11 @@ CELLS_CAPTION = (
     "its last start, beside whatever else the machine did."
 )
 COMPARISON_CAPTION = (
-    "How probable it is that a run of the row's agent ends above one of the column's on the same task: mean over tasks "
-    "that both have ended on, 95 % interval by bootstrap over runs within their task, bold where it excludes 0.5; "
-    f"none with fewer than {FEWEST} runs of either. Below it, the difference of their mean normalised returns, where "
-    "all these tasks have anchors, with the anchors' uncertainty. Of many comparisons some are bold by chance."
+    "How probable it is that a run of the row's agent ends above a run of the column's on the same task, in the mean "
+    "over the tasks that both have ended on. The 95 % interval is a bootstrap over runs within their task. A probability "
+    f"is bold where it excludes 0.5. With fewer than {FEWEST} runs of either agent there is none. Below stands the "
+    "difference of the mean normalised returns, with the anchors' uncertainty, where all these tasks have anchors. Of "
+    "many comparisons some are bold by chance."
 )
 
 
