@@ -108,9 +108,9 @@ CELLS_CAPTION = (
 COMPARISON_CAPTION = (
     "How probable it is that a run of the row's agent ends above a run of the column's on the same task, in the mean "
     "over the tasks that both have ended on. The 95 % interval is a bootstrap over runs within their task. A "
-    f"probability is bold where it excludes 0.5. With fewer than {FEWEST} runs of either agent there is none. Below "
-    "stands the difference of the mean normalised returns, with the anchors' uncertainty, where all these tasks have anchors. Of "
-    "many comparisons some are bold by chance."
+    f"probability is bold where it excludes 0.5. With fewer than {FEWEST} runs of either agent there is none. "
+    "Below stands the difference of the mean normalised returns, with the anchors' uncertainty, where all these tasks "
+    "have anchors. Of many comparisons some are bold by chance."
 )
 
 
