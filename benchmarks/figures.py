@@ -13,6 +13,7 @@ import forecast
 import ladder
 import matplotlib
 import numpy as np
+import which
 
 matplotlib.use("Agg")
 from learning import curves as learning
@@ -210,6 +211,18 @@ def costs(env: str, delays: tuple[int, ...]) -> str:
     return "\n".join(lines) + f"\n\n{env}, for each environment step of one seed; parameters at Δ = {delays[-1]}."
 
 
+def relative_costs(env: str, delays: tuple[int, ...]) -> str:
+    """Return a Markdown table of the arithmetic of each agent's updates over BPQL's, with the preset `matched`."""
+    agents = [agent for agent in AGENTS if agent not in ("random", "sac")]
+    lines = ["| Δ | " + " | ".join(f"`{agent}`" for agent in agents) + " |", "| --- " * (len(agents) + 1) + "|"]
+    for delay in delays:
+        spec = spec_of(make(env, delay, rescale=True))
+        setups = {agent: resolve(agent, env, delay, "matched", "corrected", {}) for agent in agents}
+        flops = {agent: cost_of(setup.agent, spec, setup.schedule).flops for agent, setup in setups.items()}
+        lines.append(f"| {delay} | " + " | ".join(f"{flops[agent] / flops['bpql']:.1f}" for agent in agents) + " |")
+    return "\n".join(lines) + f"\n\n{env}, from the first update on."
+
+
 def udp_table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table of the UDP demonstration: each network and controller over its episodes."""
     head, rows = lines[0], [line for line in lines if "statistics" in line]
@@ -339,6 +352,9 @@ def main() -> None:
         text = times.section(HERE / "results" / "times", images / "times.png")
         insert(root / "docs" / "performance.md", "times", text)
     insert(root / "docs" / "performance.md", "costs", costs("HalfCheetah-v5", (5, 25, 50)))
+    insert(root / "docs" / "which-agent.md", "relative-costs", relative_costs("HalfCheetah-v5", (5, 25, 50)))
+    rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2")]
+    insert(root / "docs" / "which-agent.md", "which", which.section([file for file in rows if file.exists()]))
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)
 

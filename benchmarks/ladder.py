@@ -94,7 +94,7 @@ def draw(arms: list[tuple[str, Result]], out: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
     for colour, result in arms:
         curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
-    axes.set_title("HalfCheetah-v5, 25 steps late unless said, five seeds")
+    axes.set_title("HalfCheetah-v5, 25 steps late unless said")
     axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for _, r in arms]))))
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(out, dpi=130)

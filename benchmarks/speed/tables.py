@@ -165,12 +165,14 @@ def operations() -> str:
     return "\n".join(lines)
 
 
-def blocks() -> str:
-    """Return a Markdown table of learning with several steps per call (benchmarks/updates-per-call.toml)."""
-    if not (table := RESULTS / "updates-per-call.sqlite").exists():
+def trial(grid: str, option: str, default: int, *, timed: bool) -> str:
+    """Return a Markdown table of what VDPO learns with two values of an option: the rows of a grid in benchmarks/."""
+    if not (table := RESULTS / f"{grid}.sqlite").exists():
         return ""
     rows, cells, used, _ = read_table(table)
-    lines = head("task|`--updates-per-call`|mean of all evaluations|last evaluation|last, each seed|seed-steps/s")
+    flag = option.replace("_", "-")
+    titles = f"task|`--{flag}`|mean of all evaluations|last evaluation|last, each seed"
+    lines = head(titles + "|seed-steps/s" * timed)
     for cell, progress in cells:
         returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for row in (row for row in rows if row["cell"] == cell.id and row["policy"] == "agent"):
@@ -178,14 +180,14 @@ def blocks() -> str:
         means = {step: [float(np.mean(x)) for x in seeds.values()] for step, seeds in sorted(returns.items())}
         last, speed = means[max(means)], progress.speed
         condition = cell.condition
-        cells_of = [f"{condition.env}, Δ = {condition.delay}", str(condition.overrides.get("updates_per_call", 1))]
+        cells_of = [f"{condition.env}, Δ = {condition.delay}", str(condition.overrides.get(option, default))]
         cells_of += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}"]
         cells_of += [" · ".join(f"{x:.1f}" for x in last)]
-        cells_of += [f"{speed * len(cell.seeds):.0f}" if speed else ""]
+        cells_of += [f"{speed * len(cell.seeds):.0f}" if speed else ""] * timed
         lines.append("| " + " | ".join(cells_of) + " |")
     commit = commits([{"versions": versions} for versions in used])
     about = f"VDPO, preset `{condition.preset}`, {len(cell.seeds)} seeds in lockstep. Commit {commit}."
-    return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/updates-per-call.sqlite`."])
+    return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/{table.name}`."])
 
 
 def precision() -> str:
@@ -316,7 +318,8 @@ def pages(root: Path) -> dict[str, str]:
         "speed-parts": parts(rows),
         "speed-floors": floors(rows),
         "speed-operations": operations(),
-        "speed-blocks": blocks(),
+        "speed-blocks": trial("updates-per-call", "updates_per_call", 1, timed=True),
+        "speed-tokens": trial("tokens", "tokens", 640, timed=False),
         "speed-precision": precision(),
         "speed-sizes": sizes(rows),
         "speed-memory": memory(),
