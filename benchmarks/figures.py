@@ -213,13 +213,17 @@ def costs(env: str, delays: tuple[int, ...]) -> str:
 
 def relative_costs(env: str, delays: tuple[int, ...]) -> str:
     """Return a Markdown table of the arithmetic of each agent's updates over BPQL's, with the preset `matched`."""
-    agents = [agent for agent in AGENTS if agent not in ("random", "sac")]
-    lines = ["| Δ | " + " | ".join(f"`{agent}`" for agent in agents) + " |", "| --- " * (len(agents) + 1) + "|"]
+    lines = ["| agent | " + " | ".join(f"Δ = {delay}" for delay in delays) + " |", "| --- " * (len(delays) + 1) + "|"]
+    flops: dict[str, list[float]] = defaultdict(list)
     for delay in delays:
         spec = spec_of(make(env, delay, rescale=True))
-        setups = {agent: resolve(agent, env, delay, "matched", "corrected", {}) for agent in agents}
-        flops = {agent: cost_of(setup.agent, spec, setup.schedule).flops for agent, setup in setups.items()}
-        lines.append(f"| {delay} | " + " | ".join(f"{flops[agent] / flops['bpql']:.1f}" for agent in agents) + " |")
+        for agent in AGENTS:
+            if agent not in ("random", "sac"):
+                setup = resolve(agent, env, delay, "matched", "corrected", {})
+                flops[agent].append(cost_of(setup.agent, spec, setup.schedule).flops)
+    for agent, own in sorted(flops.items(), key=lambda item: item[1][-1]):
+        ratios = (f"{mine / base:.1f}" for mine, base in zip(own, flops["bpql"], strict=True))
+        lines.append(f"| `{agent}` | " + " | ".join(ratios) + " |")
     return "\n".join(lines) + f"\n\n{env}, from the first update on."
 
 
