@@ -1,7 +1,8 @@
 """What a perfect forecast would bring: `python benchmarks/forecast.py RUN...` for runs of any-age with a forecast.
 
-Plays each policy three ways, on the same start states: late, with its forecast; late, with the true state in place of
-the forecast, which no plant can give; and without a delay. Writes benchmarks/results/forecast.jsonl.
+Plays each policy on the same start states: late, with its forecast; late, with the true state in place of the forecast,
+which no plant can give; and without a delay. The first two also with actions sampled as in training. Writes
+benchmarks/results/forecast.jsonl.
 """
 
 import json
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -20,10 +20,11 @@ from delayrl.core import networks
 from delayrl.core.forecast import forecast, forecasting
 from delayrl.core.networks import Params
 from delayrl.core.views import network_input, seen_now
+from delayrl.play.policy import Policy
 from delayrl.run.provenance import versions
 
 OUT = Path(__file__).parent / "results" / "forecast.jsonl"
-WAYS = ("forecast", "true state", "no delay")
+WAYS = ("forecast", "true state", "no delay", "forecast, sampled", "true state, sampled")
 EPISODES, FIRST_SEED = 20, 2_000_000_000  # start states that no run has seen
 Outputs = Callable[[Params, Array, Array], Array]
 """The policy's outputs, from its parameters, x_t and s_t."""
@@ -41,21 +42,28 @@ def with_truth(params: Params, x: Array, truth: Array) -> Array:
     return networks.mlp(params["policy"], truth)
 
 
-def play(policy: Any, env_name: str, delay: int, outputs: Outputs) -> tuple[list[float], float]:
-    """Return the returns of deterministic episodes, and the share of the states' variance that the forecast misses."""
-    spec, params = policy.spec, policy.state.actor
-    # one for all episodes, so that they can be stepped together
-    act = jax.jit(lambda x, truth: jnp.tanh(jnp.split(outputs(params, x, truth), 2, -1)[0]))
+def play(policy: Policy, env_name: str, delay: int, outputs: Outputs, *, sampled: bool) -> tuple[list[float], float]:
+    """Return the returns of episodes, and the share of the states' variance that the forecast misses."""
+    spec, params, learner = policy.spec, policy.state.actor, policy.agent.learner
+
+    @jax.jit  # one call for all episodes, so that they can be stepped together
+    def act(x: Array, truth: Array, key: Array) -> Array:
+        chosen = networks.gaussian(
+            params, x, learner.log_std_range, learner.log_std_bounds, lambda params, x: outputs(params, x, truth)
+        )
+        return networks.sample(chosen, key)[0] if sampled else networks.mode(chosen)
+
     predict = jax.jit(lambda x: forecast(params, x))
     envs = [delayrl.make(env_name, delay, rescale=True, history=spec.delay) for _ in range(EPISODES)]
     late, infos = map(list, zip(*[env.reset(seed=FIRST_SEED + i) for i, env in enumerate(envs)], strict=True))
     returns, running = np.zeros(EPISODES), np.ones(EPISODES, bool)
-    errors, states = [], []
+    errors, states, key = [], [], jax.random.key(0)
     while running.any():
+        key, now = jax.random.split(key)
         seen = [seen_now(obs, info, spec.delay, privileged=True) for obs, info in zip(late, infos, strict=True)]
         x = np.stack([np.asarray(network_input(one._replace(truth=None), "augmented")) for one in seen])
         truth = np.stack([one.truth for one in seen])
-        actions = np.asarray(act(x, truth))
+        actions = np.asarray(act(x, truth, now))
         errors.append((np.asarray(predict(x)) - truth)[running])
         states.append(truth[running])
         for i in np.flatnonzero(running):
@@ -72,8 +80,9 @@ def main() -> None:
     for path in map(Path, sys.argv[1:]):
         config, policy = delayrl.Run(path).config, delayrl.load(path)
         own = policy.spec.delay
-        for way, delay, outputs in zip(WAYS, (own, own, 0), (with_forecast, with_truth, with_forecast), strict=True):
-            returns, missed = play(policy, config["env"], delay, outputs)
+        for way in WAYS:
+            outputs, delay = with_truth if way.startswith("true") else with_forecast, 0 if way == "no delay" else own
+            returns, missed = play(policy, config["env"], delay, outputs, sampled=way.endswith("sampled"))
             run = {"env": config["env"], "delay": own, "seed": config["seed"], "steps": config["schedule"]["steps"]}
             lines.append(run | {"way": way, "returns": returns, "missed": round(missed, 4)})
             print(f"seed {config['seed']}, {way}: {np.mean(returns):,.0f}, missed {missed:.3f}", flush=True)
@@ -83,16 +92,19 @@ def main() -> None:
 def section() -> str:
     """Return a Markdown table of the three ways by seed, with what made it."""
     head, *lines = [json.loads(line) for line in OUT.read_text().splitlines()]
-    means = {(line["seed"], line["way"]): float(np.mean(line["returns"])) for line in lines}
-    seeds = sorted({seed for seed, _ in means})
+    returns = {(line["seed"], line["way"]): line["returns"] for line in lines}
+    seeds = sorted({seed for seed, _ in returns})
     titles = ["seed", "late, with its forecast", "late, with the true state instead", "no delay"]
+    titles += ["sampled as in training, with its forecast", "sampled, with the true state instead"]
     table = ["| " + " | ".join(titles) + " |", "|" + " --- |" * len(titles)]
     for seed in seeds:
-        table.append(f"| {seed} | " + " | ".join(f"{means[seed, way]:,.0f}" for way in WAYS) + " |")
-    mean = [np.mean([means[seed, way] for seed in seeds]) for way in WAYS]
+        values = (returns[seed, way] for way in WAYS)
+        table.append(f"| {seed} | " + " | ".join(f"{np.mean(x):,.0f} ({min(x):,.0f})" for x in values) + " |")
+    mean = [np.mean([returns[seed, way] for seed in seeds]) for way in WAYS]
     table.append("| mean | " + " | ".join(f"{value:,.0f}" for value in mean) + " |")
     what = (
-        "The same policies with the true state in place of the forecast, which no plant can give, and without a delay:"
+        "The same policies with the true state in place of the forecast, which no plant can give, and without a delay: "
+        "mean returns, and in brackets the lowest of the episodes."
     )
     about = f"{lines[0]['env']}, Δ = {lines[0]['delay']}, policies of {lines[0]['steps']:,} steps, {head['episodes']}"
     return f"{what}\n\n" + "\n".join(table) + f"\n\n{about} episodes each. Rows: `benchmarks/results/{OUT.name}`."
