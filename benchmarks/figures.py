@@ -212,19 +212,20 @@ def costs(env: str, delays: tuple[int, ...]) -> str:
 
 
 def relative_costs(env: str, delays: tuple[int, ...]) -> str:
-    """Return a Markdown table of the arithmetic of each agent's updates over BPQL's, with the preset `matched`."""
+    """Return a Markdown table of the arithmetic of each late agent's updates over BPQL's, with the preset `matched`."""
     lines = ["| agent | " + " | ".join(f"Δ = {delay}" for delay in delays) + " |", "| --- " * (len(delays) + 1) + "|"]
+    agents = {agent: registered for agent, registered in AGENTS.items() if agent not in ("random", "sac")}
     flops: dict[str, list[float]] = defaultdict(list)
     for delay in delays:
         spec = spec_of(make(env, delay, rescale=True))
-        for agent in AGENTS:
-            if agent not in ("random", "sac"):
-                setup = resolve(agent, env, delay, "matched", "corrected", {})
-                flops[agent].append(cost_of(setup.agent, spec, setup.schedule).flops)
+        for agent in agents:
+            setup = resolve(agent, env, delay, "matched", "corrected", {})
+            flops[agent].append(cost_of(setup.agent, spec, setup.schedule).flops)
     for agent, own in sorted(flops.items(), key=lambda item: item[1][-1]):
+        mark = " †" if agents[agent].presets["matched"].agent.privileged else ""
         ratios = (f"{mine / base:.1f}" for mine, base in zip(own, flops["bpql"], strict=True))
-        lines.append(f"| `{agent}` | " + " | ".join(ratios) + " |")
-    return "\n".join(lines) + f"\n\n{env}, from the first update on."
+        lines.append(f"| `{agent}`{mark} | " + " | ".join(ratios) + " |")
+    return "\n".join(lines) + f"\n\n{env}. DIDA's is a mean over its expert's steps and its student's."
 
 
 def udp_table(lines: list[dict[str, Any]]) -> str:
@@ -357,7 +358,7 @@ def main() -> None:
         insert(root / "docs" / "performance.md", "times", text)
     insert(root / "docs" / "performance.md", "costs", costs("HalfCheetah-v5", (5, 25, 50)))
     insert(root / "docs" / "which-agent.md", "relative-costs", relative_costs("HalfCheetah-v5", (5, 25, 50)))
-    rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2")]
+    rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2", "any-age-ladder")]
     insert(root / "docs" / "which-agent.md", "which", which.section([file for file in rows if file.exists()]))
     for key, text in speed.pages(root).items():
         insert(root / "docs" / "performance.md", key, text)

@@ -24,7 +24,6 @@ from delayrl.play.policy import Policy
 from delayrl.run.provenance import versions
 
 OUT = Path(__file__).parent / "results" / "forecast.jsonl"
-WAYS = ("forecast", "true state", "no delay", "forecast, sampled", "true state, sampled")
 EPISODES, FIRST_SEED = 20, 2_000_000_000  # start states that no run has seen
 Outputs = Callable[[Params, Array, Array], Array]
 """The policy's outputs, from its parameters, x_t and s_t."""
@@ -40,6 +39,16 @@ def with_truth(params: Params, x: Array, truth: Array) -> Array:
     """Return the outputs for a forecast that is right."""
     del x
     return networks.mlp(params["policy"], truth)
+
+
+WAYS: dict[str, tuple[Outputs, bool, bool]] = {
+    "forecast": (with_forecast, True, False),
+    "true state": (with_truth, True, False),
+    "no delay": (with_forecast, False, False),
+    "forecast, sampled": (with_forecast, True, True),
+    "true state, sampled": (with_truth, True, True),
+}
+"""What the policy reads, whether it is late, and whether its actions are sampled as in training."""
 
 
 def play(policy: Policy, env_name: str, delay: int, outputs: Outputs, *, sampled: bool) -> tuple[list[float], float]:
@@ -80,9 +89,8 @@ def main() -> None:
     for path in map(Path, sys.argv[1:]):
         config, policy = delayrl.Run(path).config, delayrl.load(path)
         own = policy.spec.delay
-        for way in WAYS:
-            outputs, delay = with_truth if way.startswith("true") else with_forecast, 0 if way == "no delay" else own
-            returns, missed = play(policy, config["env"], delay, outputs, sampled=way.endswith("sampled"))
+        for way, (outputs, late, sampled) in WAYS.items():
+            returns, missed = play(policy, config["env"], own * late, outputs, sampled=sampled)
             run = {"env": config["env"], "delay": own, "seed": config["seed"], "steps": config["schedule"]["steps"]}
             lines.append(run | {"way": way, "returns": returns, "missed": round(missed, 4)})
             print(f"seed {config['seed']}, {way}: {np.mean(returns):,.0f}, missed {missed:.3f}", flush=True)
@@ -90,7 +98,7 @@ def main() -> None:
 
 
 def section() -> str:
-    """Return a Markdown table of the three ways by seed, with what made it."""
+    """Return a Markdown table of the ways by seed, with what made it."""
     head, *lines = [json.loads(line) for line in OUT.read_text().splitlines()]
     returns = {(line["seed"], line["way"]): line["returns"] for line in lines}
     seeds = sorted({seed for seed, _ in returns})

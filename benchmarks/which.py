@@ -8,29 +8,31 @@ from typing import Any
 import numpy as np
 
 from delayrl.bench.results import read_table
-from delayrl.report.comparisons import make_comparisons
 from delayrl.report.results import Result, delay_order
+from delayrl.report.statistics import FEWEST, improvement_interval
 from delayrl.report.summary import summarise
 from delayrl.report.wording import number
 
-HEAD = ("task", "delay", "preset", "steps", "runs", "highest return", "not told apart from it", "lower")
+HEAD = ("task", "delay", "preset", "steps", "highest return", "not told apart from it", "lower", "not run yet")
+BUDGET = {"precision", "steps", "evaluate_every", "replay_capacity"}
+"""Overrides that leave an agent what it is."""
 
 
 def section(files: list[Path]) -> str:
     """Return a Markdown table with a line for each task and delay on which at least two agents have ended."""
-    table = ["| " + " | ".join(HEAD) + " |", "|" + " --- |" * len(HEAD)]
+    results: list[Result] = []
     for file in files:
         collected = read_table(file)
-        summary = summarise(collected.rows, collected.standing, collected.configs)
-        table += ["| " + " | ".join(cells) + " |" for cells in lines(summary.results.values())]
+        results += summarise(collected.rows, collected.standing, collected.configs).results.values()
+    table = ["| " + " | ".join(row) + " |" for row in (HEAD, ["---"] * len(HEAD), *lines(results))]
     return "\n".join(table) + f"\n\nRows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
 
 
 def lines(results: Iterable[Result]) -> list[list[str]]:
     """Return the cells of each line. Agents with other options than their preset's are left out."""
-    ended = [r for r in results if r.runs and not (r.partial or r.is_anchor) and r.place.label == r.condition.agent]
-    groups = [list(group) for _, group in groupby(sorted(ended, key=case), case)]
-    return [line(group) for group in groups if len(group) > 1]
+    plain = [r for r in results if not r.is_anchor and not r.condition.overrides.keys() - BUDGET]
+    groups = [list(group) for _, group in groupby(sorted(plain, key=case), case)]
+    return [line(group) for group in groups if len({r.condition.agent for r in group if ended(r)}) > 1]
 
 
 def case(result: Result) -> tuple[Any, ...]:
@@ -38,20 +40,28 @@ def case(result: Result) -> tuple[Any, ...]:
     return result.place.env, delay_order(result.place.delay), result.place.setting, result.condition.steps
 
 
-def line(results: list[Result]) -> list[str]:
-    """Return the cells of one case: the best agent, those that are not clearly lower, and those that are."""
-    best, *others = sorted(results, key=lambda r: -r.curves.final.mean())
-    found = [c for pair in make_comparisons(results) for c in (pair, pair.turned())]
-    lower = {c.other for c in found if c.one == best.place.label and c.clear}
-    parts = [best], *([r for r in others if (r.place.label in lower) == clear] for clear in (False, True))
-    runs = [r.runs for r in results]
-    number_of_runs = str(runs[0]) if min(runs) == max(runs) else f"{min(runs)} to {max(runs)}"
-    about = [best.place.env, str(best.place.delay), f"`{best.place.setting.preset}`", f"{best.condition.steps:,}"]
-    return [*about, number_of_runs, *(", ".join(map(score, part)) for part in parts)]
+def ended(result: Result) -> bool:
+    """Tell whether all seeds have."""
+    return result.runs == result.seeds and not result.partial
+
+
+def line(group: list[Result]) -> list[str]:
+    """Return the cells of one case. An agent that several grids hold counts once, with most of its runs."""
+    most = {r.condition.agent: r for r in sorted(group, key=lambda r: (ended(r), r.runs))}
+    best, *others = sorted(filter(ended, most.values()), key=lambda r: (r.runs < FEWEST, -r.curves.final.mean()))
+    parts: dict[bool, list[Result]] = {False: [], True: []}
+    for other in others:
+        low, _ = improvement_interval([(best.curves.final, other.curves.final)])
+        parts[bool(low > 0.5)].append(other)
+    place, setting = best.place, best.place.setting
+    settings = [f"`{setting.preset}`", *([f"`{setting.protocol}`"] if setting.protocol != "corrected" else [])]
+    scored = (", ".join(map(score, part)) for part in ([best], parts[False], parts[True]))
+    todo = ", ".join(f"`{agent}`" for agent, result in most.items() if not ended(result))
+    return [place.env, str(place.delay), ", ".join(settings), f"{best.condition.steps:,}", *scored, todo]
 
 
 def score(result: Result) -> str:
-    """Write an agent with its mean normalised return, or the raw one where an anchor is missing."""
+    """Write an agent with its mean normalised return, or the raw one where an anchor is missing, and its runs."""
     mean = float(np.mean(result.final))
     value = f"{number(float(result.curves.final.mean()))} raw" if np.isnan(mean) else f"{mean:.2f}"
-    return f"`{result.condition.agent}` {value}"
+    return f"`{result.condition.agent}` {value} ({result.runs})"

@@ -165,29 +165,30 @@ def operations() -> str:
     return "\n".join(lines)
 
 
-def trial(grid: str, option: str, default: int, *, timed: bool) -> str:
-    """Return a Markdown table of what VDPO learns with two values of an option: the rows of a grid in benchmarks/."""
+def trial(grid: str, option: str, default: int, before: str = "", *, timed: bool) -> str:
+    """Return a Markdown table of what VDPO learns with values of an option: the cells of a grid that have ended."""
     if not (table := RESULTS / f"{grid}.sqlite").exists():
         return ""
-    rows, cells, used, _ = read_table(table)
-    flag = option.replace("_", "-")
-    titles = f"task|`--{flag}`|mean of all evaluations|last evaluation|last, each seed"
+    rows, standing, used, _ = read_table(table)
+    ended = [(cell, progress) for cell, progress in standing if progress.state == "done"]
+    if not ended:
+        return ""
+    titles = f"task|`--{option.replace('_', '-')}`|mean of all evaluations|last evaluation|last, each seed"
     lines = head(titles + "|seed-steps/s" * timed)
-    for cell, progress in cells:
+    for cell, progress in ended:
         returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for row in (row for row in rows if row["cell"] == cell.id and row["policy"] == "agent"):
             returns[row["step"]][row["seed"]].append(row["return"])
         means = {step: [float(np.mean(x)) for x in seeds.values()] for step, seeds in sorted(returns.items())}
-        last, speed = means[max(means)], progress.speed
-        condition = cell.condition
-        cells_of = [f"{condition.env}, Δ = {condition.delay}", str(condition.overrides.get(option, default))]
-        cells_of += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}"]
-        cells_of += [" · ".join(f"{x:.1f}" for x in last)]
-        cells_of += [f"{speed * len(cell.seeds):.0f}" if speed else ""] * timed
-        lines.append("| " + " | ".join(cells_of) + " |")
+        last, speed, condition = means[max(means)], progress.speed, cell.condition
+        cells = [f"{condition.env}, Δ = {condition.delay}", str(condition.overrides.get(option, default))]
+        cells += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}", " · ".join(f"{x:.1f}" for x in last)]
+        cells += [f"{speed * len(cell.seeds):.0f}" if speed else ""] * timed
+        lines.append("| " + " | ".join(cells) + " |")
     commit = commits([{"versions": versions} for versions in used])
     about = f"VDPO, preset `{condition.preset}`, {len(cell.seeds)} seeds in lockstep. Commit {commit}."
-    return "\n".join([*lines, "", f"{about} Rows: `benchmarks/results/{table.name}`."])
+    about = f"{about} Rows: `benchmarks/results/{table.name}`."
+    return "\n".join([*([before, ""] if before else []), *lines, "", about])
 
 
 def precision() -> str:
@@ -319,7 +320,9 @@ def pages(root: Path) -> dict[str, str]:
         "speed-floors": floors(rows),
         "speed-operations": operations(),
         "speed-blocks": trial("updates-per-call", "updates_per_call", 1, timed=True),
-        "speed-tokens": trial("tokens", "tokens", 640, timed=False),
+        "speed-tokens": trial(
+            "tokens", "tokens", 640, "What that does to learning (0 takes whole windows):", timed=False
+        ),
         "speed-precision": precision(),
         "speed-sizes": sizes(rows),
         "speed-memory": memory(),

@@ -4,42 +4,90 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
 
 import which  # noqa: E402
-from synthetic import curve, standing  # noqa: E402
+from synthetic import Standing, curve, standing  # noqa: E402
 
+from delayrl.errors import DelayRLError  # noqa: E402
+from delayrl.report.results import Result  # noqa: E402
 from delayrl.report.summary import summarise  # noqa: E402
 
+HIGH, LOW, CLOSE = [10.0, 11, 12, 13, 14], [0.0, 1, 2, 3, 4], [9.0, 11, 12, 13, 14]
+Cells = list[tuple[Standing, list[float]]]
 
-def lines_of(env: str, delays: dict[tuple[str, int], list[float]], **changes: Any) -> list[list[str]]:
-    """Lines of agents with these final returns, one for each seed."""
-    cells = {(agent, d): standing(agent, env, d, len(x), steps=300, **changes) for (agent, d), x in delays.items()}
-    rows = [
-        row
-        for key, cell in cells.items()
-        for seed, value in enumerate(delays[key])
-        for row in curve(cell, seed, [0.0, 0.0, value])
-    ]
-    return which.lines(summarise(rows, [*cells.values()]).results.values())
+
+def cell(agent: str, finals: list[float], delay: int | str = 5, env: str = "Ant-v4", **changes: Any) -> Any:
+    """A cell with these final returns, one for each seed."""
+    return standing(agent, env, delay, len(finals), steps=300, **changes), finals
+
+
+def results(cells: Cells) -> list[Result]:
+    rows = [row for made, finals in cells for s, x in enumerate(finals) for row in curve(made, s, [0.0, 0.0, x])]
+    return [*summarise(rows, [made for made, _ in cells]).results.values()]
+
+
+def lines(*cells: Any) -> list[list[str]]:
+    return which.lines(results([*cells]))
 
 
 def test_an_agent_is_lower_where_five_runs_a_side_say_so() -> None:
-    """Three runs tell nothing apart; an agent alone has no line."""
-    high, low, close = [10.0, 11, 12, 13, 14], [0.0, 1, 2, 3, 4], [9.0, 11, 12, 13, 14]
-    anchors = {("sac", 0): [20.0, 20.0], ("random", 0): [0.0, 0.0]}
-    finals = {("bpql", 5): low, ("vdpo", 5): high, ("a-sac", 5): close, ("dida", 5): low[:3], ("bpql", 25): low}
-    many = lines_of("Ant-v4", finals | anchors)
-    assert many == [
-        ["Ant-v4", "5", "`paper`", "300", "3 to 5", "`vdpo` 0.60", "`a-sac` 0.59, `dida` 0.05", "`bpql` 0.10"]
+    """Three runs tell nothing apart, and lead nowhere where others have five; an agent alone has no line."""
+    anchors = cell("sac", [20.0, 20.0], 0), cell("random", [0.0, 0.0], 0)
+    finals = (
+        cell("bpql", LOW),
+        cell("vdpo", HIGH),
+        cell("a-sac", CLOSE),
+        cell("dida", [99.0] * 3),
+        cell("bpql", LOW, 25),
+    )
+    case = ["Ant-v4", "5", "`paper`", "300"]
+    many = ["`vdpo` 0.60 (5)", "`a-sac` 0.59 (5), `dida` 4.95 (3)", "`bpql` 0.10 (5)", ""]
+    assert lines(*anchors, *finals) == [case + many]
+    assert lines(cell("bpql", LOW[:3]), cell("vdpo", HIGH[:3])) == [
+        [*case, "`vdpo` 11.0 raw (3)", "`bpql` 1.00 raw (3)", "", ""]
     ]
-    few = lines_of("Ant-v4", {("bpql", 5): low[:3], ("vdpo", 5): high[:3]})
-    assert few == [["Ant-v4", "5", "`paper`", "300", "3", "`vdpo` 11.0 raw", "`bpql` 1.00 raw", ""]]
 
 
-def test_other_options_are_left_out() -> None:
-    cells = [standing("bpql", "Ant-v4", 5, 2, steps=300, overrides=x) for x in ({}, {"critic_norm": "layer"})]
-    cells += [standing("vdpo", "Ant-v4", 5, 2, steps=300)]
-    rows = [row for cell in cells for seed in range(2) for row in curve(cell, seed, [0.0, 0.0, 1.0])]
-    ((*_, best, others, lower),) = which.lines(summarise(rows, cells).results.values())
-    assert (best, others, lower) == ("`bpql` 1.00 raw", "`vdpo` 1.00 raw", "")
+def test_one_high_run_makes_no_other_agent_lower() -> None:
+    """The best by its mean, which loses nine of ten runs."""
+    ((*_, best, apart, lower, _),) = lines(cell("vdpo", [100.0] + [0.0] * 9), cell("bpql", [5.0] * 10))
+    assert (best, apart, lower) == ("`vdpo` 10.0 raw (10)", "`bpql` 5.00 raw (10)", "")
+
+
+def test_what_has_not_ended_is_still_to_be_run() -> None:
+    """Also where some seeds have; each task, delay, budget and protocol has its own line."""
+    running = standing("vdpo", "Ant-v4", 5, (5, 6), id="later", state="todo", step=0, steps=300), []
+    first = [cell("bpql", LOW), cell("a-sac", CLOSE), cell("vdpo", HIGH), running]
+    other = [cell(agent, HIGH, "uniform:1:5") for agent in ("bpql", "a-sac")]
+    official = [cell(agent, HIGH, protocol="official", id=f"{agent} o") for agent in ("bpql", "a-sac")]
+    table = which.lines(results(first + other + official))
+    assert [row[:4] for row in table] == [
+        ["Ant-v4", "5", "`paper`", "300"],
+        ["Ant-v4", "5", "`paper`, `official`", "300"],
+        ["Ant-v4", "uniform:1:5", "`paper`", "300"],
+    ]
+    assert table[0][4:] == ["`a-sac` 11.8 raw (5)", "", "`bpql` 2.00 raw (5)", "`vdpo`"]
+
+
+def test_a_cell_of_two_grids_counts_once() -> None:
+    """The one with more runs that have all ended."""
+    few, many = results([cell("bpql", LOW), cell("vdpo", HIGH)]), results([cell("bpql", LOW * 2)])
+    assert which.lines(few + many) == which.lines(many + few)
+    ((*_, lower, _),) = which.lines(few + many)
+    assert lower == "`bpql` 2.00 raw (10)"
+
+
+def test_other_options_are_left_out_and_budgets_are_not() -> None:
+    normed = cell("bpql", HIGH, overrides={"critic_norm": "layer"})
+    budget = {"precision": "bfloat16", "evaluate_every": 100}
+    ((*_, best, apart, lower, todo),) = lines(normed, cell("bpql", LOW, overrides=budget), cell("vdpo", CLOSE))
+    assert (best, apart, lower, todo) == ("`vdpo` 11.8 raw (5)", "", "`bpql` 2.00 raw (5)", "")
+    assert lines(normed, cell("vdpo", CLOSE)) == []
+
+
+def test_a_missing_table_is_said() -> None:
+    with pytest.raises(DelayRLError, match="there is no table"):
+        which.section([Path("none.sqlite")])
