@@ -13,7 +13,7 @@ from delayrl.report.statistics import FEWEST, improvement_interval
 from delayrl.report.summary import summarise
 from delayrl.report.wording import number
 
-HEAD = ("task", "delay", "preset", "steps", "highest return", "not told apart from it", "lower", "not run yet")
+HEAD = ("case", "highest return", "not told apart from it", "lower", "not run yet")
 BUDGET = {"precision", "steps", "evaluate_every", "replay_capacity"}
 """Overrides that leave an agent what it is."""
 
@@ -54,10 +54,11 @@ def line(group: list[Result]) -> list[str]:
         low, _ = improvement_interval([(best.curves.final, other.curves.final)])
         parts[bool(low > 0.5)].append(other)
     place, setting = best.place, best.place.setting
-    settings = [f"`{setting.preset}`", *([f"`{setting.protocol}`"] if setting.protocol != "corrected" else [])]
+    about = [place.env, f"delay {place.delay}", f"`{setting.preset}`", f"{best.condition.steps:,} steps"]
+    about += [f"protocol `{setting.protocol}`"] if setting.protocol != "corrected" else []
     scored = (", ".join(map(score, part)) for part in ([best], parts[False], parts[True]))
     todo = ", ".join(f"`{agent}`" for agent, result in most.items() if not ended(result))
-    return [place.env, str(place.delay), ", ".join(settings), f"{best.condition.steps:,}", *scored, todo]
+    return [", ".join(about), *scored, todo]
 
 
 def score(result: Result) -> str:

@@ -43,7 +43,7 @@ def test_an_agent_is_lower_where_five_runs_a_side_say_so() -> None:
         cell("dida", [99.0] * 3),
         cell("bpql", LOW, 25),
     )
-    case = ["Ant-v4", "5", "`paper`", "300"]
+    case = ["Ant-v4, delay 5, `paper`, 300 steps"]
     many = ["`vdpo` 0.60 (5)", "`a-sac` 0.59 (5), `dida` 4.95 (3)", "`bpql` 0.10 (5)", ""]
     assert lines(*anchors, *finals) == [case + many]
     assert lines(cell("bpql", LOW[:3]), cell("vdpo", HIGH[:3])) == [
@@ -64,12 +64,12 @@ def test_what_has_not_ended_is_still_to_be_run() -> None:
     other = [cell(agent, HIGH, "uniform:1:5") for agent in ("bpql", "a-sac")]
     official = [cell(agent, HIGH, protocol="official", id=f"{agent} o") for agent in ("bpql", "a-sac")]
     table = which.lines(results(first + other + official))
-    assert [row[:4] for row in table] == [
-        ["Ant-v4", "5", "`paper`", "300"],
-        ["Ant-v4", "5", "`paper`, `official`", "300"],
-        ["Ant-v4", "uniform:1:5", "`paper`", "300"],
+    assert [case for case, *_ in table] == [
+        "Ant-v4, delay 5, `paper`, 300 steps",
+        "Ant-v4, delay 5, `paper`, 300 steps, protocol `official`",
+        "Ant-v4, delay uniform:1:5, `paper`, 300 steps",
     ]
-    assert table[0][4:] == ["`a-sac` 11.8 raw (5)", "", "`bpql` 2.00 raw (5)", "`vdpo`"]
+    assert table[0][1:] == ["`a-sac` 11.8 raw (5)", "", "`bpql` 2.00 raw (5)", "`vdpo`"]
 
 
 def test_a_cell_of_two_grids_counts_once() -> None:
