@@ -1,5 +1,6 @@
 """Write the pictures and tables of the docs from committed files alone: `python benchmarks/figures.py`."""
 
+import functools
 import json
 import runpy
 import subprocess
@@ -22,13 +23,16 @@ from matplotlib import pyplot
 from PIL import Image
 from speed import tables as speed
 
+from delayrl.agents.base import Agent
 from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
 from delayrl.envs import make
 from delayrl.play.policy import spec_of
+from delayrl.report.markdown import markdown_table
 from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
 from delayrl.report.wording import gradient_steps
 from delayrl.run.condition import resolve
+from delayrl.run.cost import Cost
 from delayrl.training.cost import cost_of
 
 HERE = Path(__file__).parent
@@ -192,40 +196,39 @@ def overhead() -> str:
     )
 
 
+@functools.cache
+def matched(agent: str, env: str, delay: int, **overrides: str) -> tuple[Agent, Cost]:
+    """Return an agent of the preset `matched`, and what its learning costs."""
+    setup = resolve(agent, env, delay, "matched", "corrected", overrides)
+    return setup.agent, cost_of(setup.agent, spec_of(make(env, delay, rescale=True)), setup.schedule)
+
+
 def costs(env: str, delays: tuple[int, ...]) -> str:
     """Return a Markdown table of what each agent's learning costs with the preset `matched`; nothing is run."""
     titles = ["agent", "reads the true state", "parameters", "gradient steps"]
-    titles += [f"GFLOP, Δ = {delay}" for delay in delays]
-    lines = ["| " + " | ".join(titles) + " |", "| --- " * len(titles) + "|"]
-    specs = {delay: spec_of(make(env, delay, rescale=True)) for delay in (0, *delays)}
-    variants = [*((agent, {}) for agent in AGENTS if agent != "random"), ("any-age", {"encoder": "mlp"})]
+    body, variants = [], [*((agent, {}) for agent in AGENTS if agent != "random"), ("any-age", {"encoder": "mlp"})]
     for agent, overrides in variants:
         own = [0] * len(delays) if agent == "sac" else delays
-        setups = [resolve(agent, env, delay, "matched", "corrected", overrides) for delay in own]
-        known = [cost_of(x.agent, specs[delay], x.schedule) for x, delay in zip(setups, own, strict=True)]
+        agents, known = zip(*(matched(agent, env, delay, **overrides) for delay in own), strict=True)
         words = ", ".join([f"`{agent}`", *(f"`{name}={value}`" for name, value in overrides.items())])
         words += ", no delay" if agent == "sac" else ""
-        privileged = "in training" if setups[-1].agent.privileged else "no"
+        privileged = "in training" if agents[-1].privileged else "no"
         cells = [words, privileged, f"{known[-1].parameters:,}", gradient_steps(known[-1])]
-        lines.append("| " + " | ".join([*cells, *(f"{cost.flops / 1e9:.2f}" for cost in known)]) + " |")
-    return "\n".join(lines) + f"\n\n{env}, for each environment step of one seed; parameters at Δ = {delays[-1]}."
+        body.append([*cells, *(f"{cost.flops / 1e9:.2f}" for cost in known)])
+    table = markdown_table([*titles, *(f"GFLOP, Δ = {delay}" for delay in delays)], body)
+    return f"{table}\n\n{env}, for each environment step of one seed; parameters at Δ = {delays[-1]}."
 
 
 def relative_costs(env: str, delays: tuple[int, ...]) -> str:
     """Return a Markdown table of the arithmetic of each late agent's updates over BPQL's, with the preset `matched`."""
-    lines = ["| agent | " + " | ".join(f"Δ = {delay}" for delay in delays) + " |", "| --- " * (len(delays) + 1) + "|"]
-    agents = {agent: registered for agent, registered in AGENTS.items() if agent not in ("random", "sac")}
-    flops: dict[str, list[float]] = defaultdict(list)
-    for delay in delays:
-        spec = spec_of(make(env, delay, rescale=True))
-        for agent in agents:
-            setup = resolve(agent, env, delay, "matched", "corrected", {})
-            flops[agent].append(cost_of(setup.agent, spec, setup.schedule).flops)
-    for agent, own in sorted(flops.items(), key=lambda item: item[1][-1]):
-        mark = " †" if agents[agent].presets["matched"].agent.privileged else ""
-        ratios = (f"{mine / base:.1f}" for mine, base in zip(own, flops["bpql"], strict=True))
-        lines.append(f"| `{agent}`{mark} | " + " | ".join(ratios) + " |")
-    return "\n".join(lines) + f"\n\n{env}. DIDA's is a mean over its expert's steps and its student's."
+    known = {a: [matched(a, env, delay) for delay in delays] for a in AGENTS if a not in ("random", "sac")}
+    body = []
+    for agent, own in sorted(known.items(), key=lambda item: item[1][-1][1].flops):
+        mark = " †" if own[-1][0].privileged else ""
+        pairs = zip(own, known["bpql"], strict=True)
+        body.append([f"`{agent}`{mark}", *(f"{cost.flops / base.flops:.1f}" for (_, cost), (_, base) in pairs)])
+    table = markdown_table(["agent", *(f"Δ = {delay}" for delay in delays)], body)
+    return f"{table}\n\n{env}. DIDA's is a mean over its expert's steps and its student's."
 
 
 def udp_table(lines: list[dict[str, Any]]) -> str:

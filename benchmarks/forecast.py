@@ -5,9 +5,11 @@ which no plant can give; and without a delay. The first two also with actions sa
 benchmarks/results/forecast.jsonl.
 """
 
+import functools
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from delayrl.core.forecast import forecast, forecasting
 from delayrl.core.networks import Params
 from delayrl.core.views import network_input, seen_now
 from delayrl.play.policy import Policy
+from delayrl.report.markdown import markdown_table
 from delayrl.run.provenance import versions
 
 OUT = Path(__file__).parent / "results" / "forecast.jsonl"
@@ -57,9 +60,8 @@ def play(policy: Policy, env_name: str, delay: int, outputs: Outputs, *, sampled
 
     @jax.jit  # one call for all episodes, so that they can be stepped together
     def act(x: Array, truth: Array, key: Array) -> Array:
-        chosen = networks.gaussian(
-            params, x, learner.log_std_range, learner.log_std_bounds, lambda params, x: outputs(params, x, truth)
-        )
+        network = functools.partial(outputs, truth=truth)
+        chosen = replace(learner, actor_network=network).policy(params, x)
         return networks.sample(chosen, key)[0] if sampled else networks.mode(chosen)
 
     predict = jax.jit(lambda x: forecast(params, x))
@@ -104,18 +106,16 @@ def section() -> str:
     seeds = sorted({seed for seed, _ in returns})
     titles = ["seed", "late, with its forecast", "late, with the true state instead", "no delay"]
     titles += ["sampled as in training, with its forecast", "sampled, with the true state instead"]
-    table = ["| " + " | ".join(titles) + " |", "|" + " --- |" * len(titles)]
-    for seed in seeds:
-        values = (returns[seed, way] for way in WAYS)
-        table.append(f"| {seed} | " + " | ".join(f"{np.mean(x):,.0f} ({min(x):,.0f})" for x in values) + " |")
-    mean = [np.mean([returns[seed, way] for seed in seeds]) for way in WAYS]
-    table.append("| mean | " + " | ".join(f"{value:,.0f}" for value in mean) + " |")
+    values = {seed: [returns[seed, way] for way in WAYS] for seed in seeds}
+    body = [[str(seed), *(f"{np.mean(x):,.0f} ({min(x):,.0f})" for x in own)] for seed, own in values.items()]
+    body.append(["mean", *(f"{np.mean(ways):,.0f}" for ways in zip(*values.values(), strict=True))])
     what = (
         "The same policies with the true state in place of the forecast, which no plant can give, and without a delay: "
         "mean returns, and in brackets the lowest of the episodes."
     )
     about = f"{lines[0]['env']}, Δ = {lines[0]['delay']}, policies of {lines[0]['steps']:,} steps, {head['episodes']}"
-    return f"{what}\n\n" + "\n".join(table) + f"\n\n{about} episodes each. Rows: `benchmarks/results/{OUT.name}`."
+    about += f" episodes each. Rows: `benchmarks/results/{OUT.name}`."
+    return f"{what}\n\n{markdown_table(titles, body)}\n\n{about}"
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from matplotlib import pyplot
 
 from delayrl.bench.results import read_table
 from delayrl.report import statistics
+from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
 
@@ -46,17 +47,12 @@ def front(results: list[Result]) -> str:
         seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
         cells = [f"`{result.condition.agent}`", str(result.place.delay), spread(result.curves.final), seeds]
         body.append([*cells, f"{result.condition.steps:,}", gflop(result)])
-    return written(head, body)
+    return markdown_table(head, body)
 
 
 def gflop(result: Result) -> str:
     """Write the arithmetic of a step; empty if it is unknown."""
     return f"{result.cost.flops / 1e9:.2f}" if result.cost else ""
-
-
-def written(head: list[str], body: list[list[str]]) -> str:
-    """Write a table in Markdown."""
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
 
 
 def area(result: Result) -> statistics.Floats:
@@ -86,7 +82,7 @@ def table(results: list[Result]) -> str:
         apart = difference(own, base) if compared else ""
         cells = [name(result), str(result.runs), spread(own), times, apart, spread(final)]
         body.append([*cells, f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
-    return written(head, body)
+    return markdown_table(head, body)
 
 
 def draw(arms: list[tuple[str, Result]], out: Path) -> None:

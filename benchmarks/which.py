@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from delayrl.bench.results import read_table
+from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result, delay_order
 from delayrl.report.statistics import FEWEST, improvement_interval
 from delayrl.report.summary import summarise
@@ -24,8 +25,8 @@ def section(files: list[Path]) -> str:
     for file in files:
         collected = read_table(file)
         results += summarise(collected.rows, collected.standing, collected.configs).results.values()
-    table = ["| " + " | ".join(row) + " |" for row in (HEAD, ["---"] * len(HEAD), *lines(results))]
-    return "\n".join(table) + f"\n\nRows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
+    names = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
+    return f"{markdown_table(HEAD, lines(results))}\n\nRows: {names}."
 
 
 def lines(results: Iterable[Result]) -> list[list[str]]:

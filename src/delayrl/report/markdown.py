@@ -45,7 +45,7 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
                 parts += [f"### {name}", *(f"![{name}](img/{file})" for file in files)]
         if costs := wording.costs(summary, setting):
             body = [[_escape(text) for text in line] for line in costs]
-            parts += ["### Cost of an agent", wording.COST_CAPTION, _table(wording.COST_HEAD, body)]
+            parts += ["### Cost of an agent", wording.COST_CAPTION, markdown_table(wording.COST_HEAD, body)]
         parts += ["### Anchors", _anchors(results), "### All cells", _results(summary, results)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -56,7 +56,8 @@ def _escape(text: object) -> str:
     return re.sub(r"([\\`*_\[\]|~$#!])", r"\\\1", plain)
 
 
-def _table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """Write a table of cells that are Markdown already."""
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---" for _ in head], *body))
 
 
@@ -70,7 +71,7 @@ def _paper_table(summary: Summary, table: Table) -> str:
             parts = texts._replace(note=_escape(texts.note))
             line.append("<br>".join(form.format(text) for form, text in zip(shown, parts, strict=True) if text))
         body.append(line)
-    return _table(["Task", "Δ", *(_escape(summary.name(column)) for column in table.columns)], body)
+    return markdown_table(["Task", "Δ", *(_escape(summary.name(column)) for column in table.columns)], body)
 
 
 def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
@@ -88,7 +89,7 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
             counts = GREY.format(f"{wording.tasks(a.tasks, delay)}, {wording.count(a.runs, 'run')}")
             line.append(f"**{a.iqm:.2f}**{interval}<br>{counts}")
         body.append(line)
-    return _table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
+    return markdown_table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
 
 
 def _comparisons(summary: Summary, comparisons: Sequence[Comparison]) -> str:
@@ -109,7 +110,7 @@ def _comparisons(summary: Summary, comparisons: Sequence[Comparison]) -> str:
                 ]
                 line.append("<br>".join(part for part in parts if part))
             body.append(line)
-    return _table(["Δ", "Agent", *(f"over {_escape(summary.name(label))}" for label in labels)], body)
+    return markdown_table(["Δ", "Agent", *(f"over {_escape(summary.name(label))}" for label in labels)], body)
 
 
 def _anchors(results: Iterable[Result]) -> str:
@@ -119,7 +120,7 @@ def _anchors(results: Iterable[Result]) -> str:
         values = [wording.anchor(a) or "none" for a in anchors]
         key = r.place.env, r.condition.steps
         body[key] = (_escape(r.place.env), f"{r.condition.steps:,}", *values, _escape(r.reference_anchor.source))
-    return _table(("Task", "Steps", "Random", "Ret_df", "Ret_df is the return of"), body.values())
+    return markdown_table(("Task", "Steps", "Random", "Ret_df", "Ret_df is the return of"), body.values())
 
 
 def _results(summary: Summary, results: Iterable[Result]) -> str:
@@ -145,4 +146,4 @@ def _results(summary: Summary, results: Iterable[Result]) -> str:
         "Hours",
         "State",
     )
-    return f"{wording.CELLS_CAPTION}\n\n{_table(heads, body)}"
+    return f"{wording.CELLS_CAPTION}\n\n{markdown_table(heads, body)}"
