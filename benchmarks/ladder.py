@@ -11,6 +11,7 @@ from delayrl.report import statistics
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
+from delayrl.report.wording import interval, normalised
 
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 900 to 1,450."""
@@ -33,19 +34,22 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str]:
     draw([(FRONT[name(r)], r) for r in shown], pictures / "halfcheetah.png")
     every = [used for collected in files_read for used in collected.versions]
     words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
-    made = (
-        "; ".join(dict.fromkeys(words)) + f". Rows: {', '.join(f'`benchmarks/results/{file.name}`' for file in files)}."
-    )
-    return f"{table(learners)}\n\n{made}", f"{front(shown)}\n\nHalfCheetah-v5, preset `matched`; {made}"
+    rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
+    made = "HalfCheetah-v5, preset `matched` with `--precision bfloat16`. ± is the standard deviation over seeds, each "
+    made += f"of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
+    commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
+    return f"{table(learners)}\n\n{made} Commits: {commits}.", f"{front(shown)}\n\n{made}"
 
 
 def front(results: list[Result]) -> str:
     """Return the table of the first page."""
-    head = ["agent", "delay", "return at the end", "each seed", "steps", "GFLOP a step"]
+    head = ["agent", "delay", "normalised, 95 % interval", "return at the end", "each seed", "steps", "GFLOP a step"]
     body = []
     for result in results:
         seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
-        cells = [f"`{result.condition.agent}`", str(result.place.delay), spread(result.curves.final), seeds]
+        mean, within = result.final.mean(), interval(result.final_interval, normalised)
+        score = "" if np.isnan(mean) else normalised(mean) + (f" ({within})" if within else "")
+        cells = [f"`{result.condition.agent}`", str(result.place.delay), score, spread(result.curves.final), seeds]
         body.append([*cells, f"{result.condition.steps:,}", gflop(result)])
     return markdown_table(head, body)
 

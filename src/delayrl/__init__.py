@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from delayrl.wrappers import Delayed as Delayed
     from delayrl.wrappers import DelayedVector as DelayedVector
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOME = {
     "AGENTS": "agents.registry",

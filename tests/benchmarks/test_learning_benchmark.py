@@ -63,4 +63,4 @@ def test_the_ladder_compares_with_bpql() -> None:
     assert cells[0][6:] == ["1 of 2", "1.23"]
     assert cells[1][3:5] == ["", ""]
     assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
-    assert ladder.front([base]).splitlines()[2] == "| `bpql` | 25 | 1,100 ± 141 | 1,000 · 1,200 | 0 | 1.23 |"
+    assert ladder.front([base]).splitlines()[2] == "| `bpql` | 25 |  | 1,100 ± 141 | 1,000 · 1,200 | 0 | 1.23 |"

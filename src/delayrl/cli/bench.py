@@ -28,7 +28,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     def add_command(name: str, text: str) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
-        command.add_argument("grid", metavar="GRID", help=f"a .toml file, or one of {', '.join(shipped())}")
+        table = ", a table that `collect` wrote (.sqlite)" if name == "report" else ""
+        command.add_argument("grid", metavar="GRID", help=f"a .toml file{table}, or one of {', '.join(shipped())}")
         command.add_argument("--runs", type=Path, default="runs/bench", help="the cells' folder (default: runs/bench)")
         return command
 

@@ -34,7 +34,8 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
                 parts += [f"### {_escape(table.title)}", caption, _paper_table(summary, table), wording.source(table)]
         aggregates = [a for a in summary.aggregates if a.setting == setting]
         if aggregates:
-            parts += ["### Interquartile mean of the normalised return over tasks", _aggregates(summary, aggregates)]
+            parts += ["### Interquartile mean of the normalised return over tasks", wording.AGGREGATE_CAPTION]
+            parts.append(_aggregates(summary, aggregates))
         alternative = "Interquartile means and performance profiles"
         parts += [f"![{alternative}](img/{file})" for file in pictures.get((setting, "aggregates"), [])]
         if comparisons := [c for c in summary.comparisons if c.setting == setting]:
@@ -46,7 +47,7 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
         if costs := wording.costs(summary, setting):
             body = [[_escape(text) for text in line] for line in costs]
             parts += ["### Cost of an agent", wording.COST_CAPTION, markdown_table(wording.COST_HEAD, body)]
-        parts += ["### Anchors", _anchors(results), "### All cells", _results(summary, results)]
+        parts += ["### Anchors", _anchors(results), "### All results", _results(summary, results)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

@@ -69,6 +69,7 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "costCaption": wording.COST_CAPTION,
         "cellsCaption": wording.CELLS_CAPTION,
         "thresholds": _rounded(THRESHOLDS),
+        "aggregateCaption": wording.AGGREGATE_CAPTION,
         "aggregates": [_aggregate(a, names) for a in summary.aggregates],
         "comparisons": [_comparison(c, names) for half in summary.comparisons for c in (half, half.turned())],
         "comparisonCaption": wording.COMPARISON_CAPTION,

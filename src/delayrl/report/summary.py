@@ -160,7 +160,10 @@ def _differing(cells: Sequence[Cell]) -> set[str]:
 
 
 def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
-    """Aggregate the results of learners whose seeds have ended and whose task has both anchors."""
+    """Aggregate the results of learners whose seeds have ended and whose task has both anchors.
+
+    Only agents with the same tasks can be compared: an agent that lacks a task of another's is left out.
+    """
     chosen: dict[tuple[Setting, int | str | None, str], list[Result]] = defaultdict(list)
     for result in results:
         place = result.place
@@ -170,7 +173,11 @@ def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
         if isinstance(place.delay, int):
             chosen[place.setting, None, place.label].append(result)
     delays = Counter(setting for setting, delay in {key[:2] for key in chosen} if isinstance(delay, int))
-    keys = [key for key in chosen if key[1] is not None or delays[key[0]] > 1]
+    tasks_of = {key: {(result.place.env, result.place.delay) for result in own} for key, own in chosen.items()}
+    every: dict[Any, set[Any]] = defaultdict(set)
+    for (setting, delay, _), tasks in tasks_of.items():
+        every[setting, delay] |= tasks
+    keys = [key for key in chosen if (key[1] is not None or delays[key[0]] > 1) and tasks_of[key] == every[key[:2]]]
     return sorted((_aggregate(*key, chosen[key]) for key in keys), key=_order)
 
 

@@ -105,12 +105,16 @@ CELLS_CAPTION = (
     "Returns after the last step. Hours: of one worker, on a CPU one core, for all seeds together, at the speed since "
     "its last start, beside whatever else the machine did."
 )
+AGGREGATE_CAPTION = (
+    "Over all runs of all tasks; 95 % interval. Agents that lack a task on which another has ended at this delay are "
+    "left out, because means over different tasks cannot be compared."
+)
 COMPARISON_CAPTION = (
     "How probable it is that a run of the row's agent ends above a run of the column's on the same task, in the mean "
     "over the tasks that both have ended on. The 95 % interval is a bootstrap over runs within their task. A "
-    f"probability is bold where it excludes 0.5. With fewer than {FEWEST} runs of either agent there is none. "
-    "Below stands the difference of the mean normalised returns, with the anchors' uncertainty, where all these tasks "
-    "have anchors. Of many comparisons some are bold by chance."
+    f"probability is bold where it excludes 0.5. With fewer than {FEWEST} runs of either agent on a task there is no "
+    "interval. Below stands the difference of the mean normalised returns, with the anchors' uncertainty, where all "
+    "these tasks have anchors. Of many comparisons some are bold by chance."
 )
 
 
@@ -203,10 +207,10 @@ def paper(summary: Summary) -> str:
 
 
 def states(summary: Summary) -> str:
-    """Write how many cells are done, running, failed and to do."""
+    """Write how many results are done, running, failed and to do."""
     number_of = Counter(result.progress.state for result in summary.results.values())
     parts = [f"{number_of[state]} {state}" for state in ("done", "running", "failed", "todo") if number_of[state]]
-    return f"{count(len(summary.results), 'cell')}: {', '.join(parts)}"
+    return f"{count(len(summary.results), 'result')}: {', '.join(parts)}"
 
 
 def overrides(summary: Summary) -> list[str]:
