@@ -144,38 +144,44 @@ def test_equal_delays_are_a_sac() -> None:
 
 
 def test_a_round_is_its_parts() -> None:
-    """The coin, the actor and both temperatures have keys of their own; the temperatures follow their own actors."""
+    """The actor and both temperatures have keys of their own; the temperatures follow their own actors."""
     agent, state = started(actor_updates=1)
     now = agent.inputs(windows_of(), 0)
     improve = [jax.jit(lambda s, k, f=f: f(s, now, k)) for f in (agent.improve_augmented, agent.improve_auxiliary)]
     adjust = jax.jit(lambda learner, x, key: agent.learner.adjust_temperature(learner, x, -1.5, key))
-    whole = jax.jit(lambda key: agent._improve(state, now, -1.5, key))
+    whole = jax.jit(lambda key, count: agent._improve(state, now, -1.5, key, count))
     took = set()
-    for seed in range(4):
-        keys = jax.random.split(jax.random.split(jax.random.key(seed), 1)[0], 4)
-        coin = int(jax.random.bernoulli(keys[0]))
-        expected = improve[coin](state, keys[1])
-        short = adjust(expected.auxiliary, now.auxiliary, keys[2])
-        own = adjust(augmented_learner(expected), now.augmented, keys[3])
-        near(whole(jax.random.key(seed)), with_augmented(expected._replace(auxiliary=short), own))
+    for count in range(1, 9, 2):
+        keys = jax.random.split(jax.random.split(jax.random.key(count), 1)[0], 3)
+        coin = int(jax.random.bernoulli(jax.random.fold_in(jax.random.key(0), count), shape=(1,))[0])
+        expected = improve[coin](state, keys[0])
+        short = adjust(expected.auxiliary, now.auxiliary, keys[1])
+        own = adjust(augmented_learner(expected), now.augmented, keys[2])
+        near(whole(jax.random.key(count), jnp.int32(count)), with_augmented(expected._replace(auxiliary=short), own))
         took.add(coin)
     assert took == {0, 1}
 
 
 def test_a_coin_says_which_actor_learns() -> None:
-    """On odd counts one actor for each round, either one about as often; both temperatures; on even counts neither."""
+    """On odd counts one actor for each round, either one about as often; both temperatures; on even counts neither.
+
+    Seeds in lockstep share the coin, so that only the update of the actor that it names is computed.
+    """
     agent, state = started(actor_updates=1)
     update = jax.jit(agent.update)
     windows = windows_of()
     took = []
-    for seed in range(40):
-        new, _ = update(state, windows, jax.random.key(seed), jnp.int32(1))
+    for count in range(1, 80, 2):
+        new, _ = update(state, windows, jax.random.key(0), jnp.int32(count))
         auxiliary = not same(new.auxiliary.actor, state.auxiliary.actor)
         assert same(new.actor, state.actor) == auxiliary
         assert new.auxiliary.log_temperature != state.auxiliary.log_temperature
         assert new.log_temperature != state.log_temperature
         took.append(auxiliary)
     assert 10 <= sum(took) <= 30
+    keys = jax.random.split(jax.random.key(0), 3)
+    lockstep = jax.make_jaxpr(jax.vmap(agent.update, (None, None, 0, None)))(state, windows, keys, jnp.int32(1))
+    assert str(lockstep).count("cond[") == 2
     even, _ = update(state, windows, jax.random.key(0), jnp.int32(2))
     assert same(even._replace(auxiliary=state.auxiliary), state)
     assert same(even.auxiliary.actor, state.auxiliary.actor)

@@ -101,3 +101,9 @@ def test_a_run_keeps_its_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert train("bpql", tmp_path / "plain").rows() != whole.rows()
     with pytest.raises(delayrl.DelayRLError, match="observation_norm must be one of none, running; got 'batch'"):
         train("bpql", tmp_path / "bad", observation_norm="batch")
+
+
+def test_a_frozen_expert_sees_what_it_learned_from(tmp_path: Path) -> None:
+    """Its moments would go on with the student's data."""
+    with pytest.raises(delayrl.DelayRLError, match="dida takes observation_norm none; got running"):
+        train("dida", tmp_path / "run", observation_norm="running")

@@ -177,7 +177,7 @@ def test_actor_by_hand() -> None:
         value = networks.twin(state.critic, x, action).min(0) - 0.5 * log_prob
         return (3 * policy.mean**2).mean() - value.mean()
 
-    new = agent.improve_actor(state, x, x, key, lambda policy: (3 * policy.mean**2).mean())
+    new = agent.improve_actor(state, x, x, key, lambda actor, policy: (3 * policy.mean**2).mean())
     near(new.actor, adams_first_step(state.actor, jax.grad(loss)(state.actor), 1e-3))
 
 

@@ -61,10 +61,12 @@ def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
         train("bpql", tmp_path / "run", threads=0)
 
 
-@pytest.mark.parametrize(("update_after", "first"), [(5, 22), (60, 60), (0, 100)])
-def test_first_update(update_after: int, first: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("delay", "update_after", "first"), [("20", 5, 22), ("5+reward=20", 5, 22), ("20", 60, 60), ("20", 0, 100)]
+)
+def test_first_update(delay: str, update_after: int, first: int, tmp_path: Path) -> None:
     """At its step, at the end of the random ones if none is given, or as soon as a transition has arrived."""
-    options = {"delay": 20, "steps": 200, "random_steps": 100, "update_after": update_after}
+    options = {"delay": delay, "steps": 200, "random_steps": 100, "update_after": update_after}
     run = train("bpql", tmp_path / "run", **options)
     assert arrays(run)["critic_opt_state.0.count"] == 200 - first + 1
 

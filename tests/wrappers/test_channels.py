@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import delayrl
 from delayrl.delays import Delay, PerEpisode, as_delay
 from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
+from delayrl.wrappers.transit import Fill
 from strategies import DELAYS
 
 
@@ -381,13 +382,17 @@ def test_arrays_belong_to_whoever_holds_them(delay: int) -> None:
         info["actions"][:] = 99
 
 
-def test_travel_times_of_another_seed() -> None:
-    one, other = (Delayed(Journal(40), "uniform:0:5") for _ in range(2))
+@pytest.mark.parametrize("fill", ["first", "zeros"])
+@pytest.mark.parametrize("delay", ["uniform:0:5", "episode:0:9"])
+def test_travel_times_of_another_seed(delay: str, fill: Fill) -> None:
+    one, other = (Delayed(Journal(40), delay, fill=fill) for _ in range(2))
     one.reset(seed=1)
-    one.draw_from(7)
-    other.reset(seed=7)
+    assert one.draw_from(7)[1]["age"] == other.reset(seed=7)[1]["age"]
     ages = [[env.step(np.float32([0]))[4]["age"] for _ in range(30)] for env in (one, other)]
     assert ages[0] == ages[1]
+
+
+def test_travel_times_of_actions_of_another_seed() -> None:
     late = Delayed(Journal(40), "action=episode:0:90", history=90)
     late.reset(seed=1)
     assert late.draw_from(7)[1]["age"] == late.reset(seed=7)[1]["age"] != late.reset(seed=1)[1]["age"]

@@ -117,7 +117,7 @@ class ADSAC:
         auxiliary, metrics = self.learner.learn_critic(state.auxiliary, windows, now.auxiliary, next_value)
         state = jax.lax.cond(
             count % self.learner.actor_every == self.learner.actor_every - 1,
-            lambda state: self._improve(state, now, target_entropy, actor_key),
+            lambda state: self._improve(state, now, target_entropy, actor_key, count),
             lambda state: state,
             state._replace(auxiliary=auxiliary),
         )
@@ -152,12 +152,17 @@ class ADSAC:
 
         return jax.vmap(of_window)(windows, jnp.broadcast_to(ahead, windows.n_step.shape))
 
-    def _improve(self, state: State, now: Inputs, target_entropy: float, key: Key) -> State:
-        """Improve a randomly chosen actor and both temperatures, `actor_updates` times, with the values of x^τ."""
-        for update_key in jax.random.split(key, self.learner.actor_updates):
-            coin_key, policy_key, auxiliary_key, augmented_key = jax.random.split(update_key, 4)
+    def _improve(self, state: State, now: Inputs, target_entropy: float, key: Key, count: Int[Array, ""]) -> State:
+        """Improve a randomly chosen actor and both temperatures, `actor_updates` times, with the values of x^τ.
+
+        All seeds share the coins. With one for each, `jax.vmap` would compute both actors' updates and drop one.
+        """
+        coin_key = jax.random.fold_in(jax.random.key(0), count)
+        coins = jax.random.bernoulli(coin_key, shape=(self.learner.actor_updates,))
+        for coin, update_key in zip(coins, jax.random.split(key, self.learner.actor_updates), strict=True):
+            policy_key, auxiliary_key, augmented_key = jax.random.split(update_key, 3)
             state = jax.lax.cond(
-                jax.random.bernoulli(coin_key),
+                coin,
                 lambda state, key: self.improve_auxiliary(state, now, key),
                 lambda state, key: self.improve_augmented(state, now, key),
                 state,

@@ -21,13 +21,13 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Deterministic, Phase, Schedule, descend
+from delayrl.agents.base import Agent, Deterministic, Phase, Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
 from delayrl.core.forecast import follow_changes, forecast_init, forecast_loss, forecasting, in_task_units
 from delayrl.core.networks import Gaussian, Params
-from delayrl.core.objectives import annealed, gaussian_kl, masked_mean, soft_value
+from delayrl.core.objectives import annealed, gaussian_kl, masked_mean
 from delayrl.core.sequence import sequence, sequence_init, tokens
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import network_input, view
@@ -85,13 +85,14 @@ class AnyAge:
         state = self.bpql.init(spec, key)
         if self.encoder == "mlp" or spec.delay == 0:
             return state
-        actor_key, belief_key = jax.random.split(jax.random.fold_in(key, 1))
+        actor_key = jax.random.split(jax.random.fold_in(key, 1))[0]
         if self.encoder == "forecast":
             actor = forecast_init(actor_key, spec, self.bpql.hidden, 2 * spec.action_size)
         else:
             sizes = self.encoder_width, self.encoder_layers, self.bpql.hidden, 2 * spec.action_size
             actor = sequence_init(actor_key, spec, *sizes)
         if self.belief_weight:
+            belief_key = jax.random.fold_in(key, 2)  # no key of BPQL's
             actor["belief"] = networks.linear_init(belief_key, self.encoder_width, spec.obs_size)
         return state._replace(actor=actor, actor_opt_state=optax.adam(self.bpql.actor_learning_rate).init(actor))
 
@@ -117,7 +118,7 @@ class AnyAge:
         if (self.second_age == "none" and self.encoder != "forecast") or windows.delay == 0:
             return self.learner.update(state, windows, key, count)
         age_key, update_key = jax.random.split(key)
-        weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
+        weight = self.weight(self.phases()[0].step_of(count))
         younger = None if self.second_age == "none" else self.younger(windows, age_key)
         improve = functools.partial(self.improve_actor, windows, younger, weight)
         state, metrics = self.learner.update(state, windows, update_key, count, improve)
@@ -142,26 +143,22 @@ class AnyAge:
     ) -> State:
         """Take one gradient step on the actor: as much for each age, the pull of the older one, its encoder's loss."""
         x = self.views(actor_input, younger)
-        states, temperature = jnp.stack([critic_input] * len(x)), jnp.exp(state.log_temperature)
+        states = jnp.stack([critic_input] * len(x))
 
-        def loss(actor: Params) -> tuple[Array, None]:
-            policy = self.learner.policy(actor, x)
-            action, log_prob = networks.sample(policy, key)
-            q = networks.twin(state.critic, states, action)
-            total = -soft_value(q, log_prob, temperature).mean()
+        def penalty(actor: Params, policy: Gaussian) -> Array:
+            total = jnp.zeros(())
             if self.pull_weight and younger is not None:
                 total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.encoder == "forecast":
                 total += forecast_loss(actor, x, states)
             if self.belief_weight:
                 total += self.belief_weight * belief_loss(actor, actor_input, windows)
-            return total, None
+            return total
 
-        adam = optax.adam(self.bpql.actor_learning_rate)
-        actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)
+        state = self.learner.improve_actor(state, x, states, key, penalty)
         if self.encoder == "forecast":
-            actor = follow_changes(actor, x, states)
-        return state._replace(actor=actor, actor_opt_state=opt_state)
+            state = state._replace(actor=follow_changes(state.actor, x, states))
+        return state
 
     def views(self, own: Float[Array, "batch input"], younger: Array | None) -> Float[Array, "ages batch input"]:
         """Return what the actor learns at: each sample at its own age and the younger in turn; with a pull, at both."""

@@ -30,6 +30,10 @@ class Phase(NamedTuple):
     batch: int
     update: Callable[[State, Window, Key, Int[Array, ""]], tuple[State, Metrics]]
 
+    def step_of(self, count: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the environment step of the update with this count."""
+        return count // self.updates * self.every
+
 
 class Deterministic(NamedTuple):
     """An agent's deterministic policy as plain networks, for callers that run it without the agent.

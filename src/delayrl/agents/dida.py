@@ -71,7 +71,12 @@ class DIDA:
         return self.reference, state.reference
 
     def for_run(self, schedule: Schedule) -> "DIDA":
-        """Return the agent. Raises DelayRLError unless the expert finishes between the random steps and the end."""
+        """Return the agent. Raises DelayRLError unless the expert finishes between the random steps and the end.
+
+        And for running moments, which would go on to change what the frozen expert sees.
+        """
+        if schedule.observation_norm != "none":
+            raise DelayRLError(f"dida takes observation_norm none; got {schedule.observation_norm}")
         if not schedule.random_steps < self.expert_steps < schedule.steps:
             raise DelayRLError(
                 f"expert_steps must lie between random_steps and steps, {schedule.random_steps} and {schedule.steps}; "
@@ -142,7 +147,7 @@ class DIDA:
             return student, opt_state, loss
 
         student, opt_state, loss = jax.lax.cond(
-            count // self.imitation_updates * self.round_steps >= self.expert_steps,
+            self.phases()[1].step_of(count) >= self.expert_steps,
             learn,
             lambda student, opt_state: (student, opt_state, jnp.zeros(())),
             state.student,

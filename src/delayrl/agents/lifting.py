@@ -102,10 +102,10 @@ class Lifting:
         reference = state.reference._replace(log_temperature=shared)
         reference, of_reference = self.reference.update(reference, windows, reference_key, count)
         towards = self.bpql.policy(reference.actor, windows.obs[:, windows.delay])
-        weight = self.weight(count // self.bpql.updates * self.bpql.update_every)
+        weight = self.weight(self.bpql.phases()[0].step_of(count))
         before = self.bpql.policy(state.delayed.actor, jax.vmap(lambda window: look(window, "augmented"))(windows))
         improve = functools.partial(
-            self.bpql.improve_actor, penalty=lambda policy: weight * lifting_loss(policy, towards)
+            self.bpql.improve_actor, penalty=lambda actor, policy: weight * lifting_loss(policy, towards)
         )
         delayed, metrics = self.bpql.update(state.delayed, windows, delayed_key, count, improve)
         state = State(delayed, reference._replace(log_temperature=delayed.log_temperature))

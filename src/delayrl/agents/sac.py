@@ -47,11 +47,11 @@ class State(NamedTuple):
 EntropyUnit = Literal["scaled", "task"]
 ImproveActor = Callable[[State, Array, Array, Key], State]
 """One step of the actor, given the inputs of actor and critics: agents built on SAC may have their own."""
-Penalty = Callable[[Gaussian], Array]
-"""A term that agents built on SAC add to the actor's loss: a function of its policy on the batch."""
+Penalty = Callable[[Params, Gaussian], Array]
+"""A term that agents built on SAC add to the actor's loss: of the actor and its policy on the batch."""
 
 
-def no_penalty(policy: Gaussian) -> Array:
+def no_penalty(actor: Params, policy: Gaussian) -> Array:
     """Return 0: SAC itself adds nothing to the actor's loss."""
     return jnp.zeros(())
 
@@ -192,7 +192,7 @@ class SAC:
             policy = self.policy(actor, actor_input)
             action, log_prob = networks.sample(policy, key)
             value = soft_value(networks.twin(state.critic, critic_input, action), log_prob, temperature)
-            return penalty(policy) - value.mean(), None
+            return penalty(actor, policy) - value.mean(), None
 
         adam = optax.adam(self.actor_learning_rate)
         actor, opt_state, _, _ = descend(adam, loss, state.actor, state.actor_opt_state)

@@ -120,6 +120,11 @@ class Delay:
         """Δ, the longest history that a decision needs: the longest observation delay and the longest action delay."""
         return self.observation.maximum + self.action.maximum
 
+    @property
+    def latest(self) -> int:
+        """After how many steps all of a step has arrived, overtaken messages and its reward too."""
+        return self.action.maximum + max(self.observation.maximum, self.reward.maximum)
+
     def observed(self) -> "Delay":
         """Move the delay of the actions to the observations, as training does.
 

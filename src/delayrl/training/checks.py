@@ -27,7 +27,7 @@ def check_ways(threads: int, track: str | None, callback: Any) -> None:
 def check_fit(setup: Setup, env: Delayed) -> State:
     """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
     agent, schedule, spec = setup.agent, setup.schedule, spec_of(env)
-    least = 2 * (spec.delay + agent.ahead(spec)) + 2
+    least = 2 * (setup.delay.latest + agent.ahead(spec)) + 2
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")

@@ -145,14 +145,14 @@ class Loop:
         """Return the actions, but those of the protocol in episodes that open."""
         opening = self.group.setup.protocol.opening
         length = opening_length(opening, self.group.spec.delay)
-        if not length:
-            return actions
         opens = np.array([[len(actor.actions) < length] for actor in self.state.actors])
+        if not opens.any():  # does not wait for the actions
+            return actions
         return np.where(opens, np.float32(0) if opening == "zeros" else self._random_actions(), actions)
 
     def _can_learn(self) -> bool:
-        """Whether every seed has steps to learn from, even while its newest Δ are hidden."""
-        return int(self.state.learner.replay.steps.min()) > self.group.spec.delay
+        """Whether every seed has steps to learn from, even while its newest are hidden."""
+        return int(self.state.learner.replay.steps.min()) > self.group.setup.delay.latest
 
     def _random_actions(self) -> NDArray[np.float32]:
         generators = [np.random.default_rng([seed, RANDOM_ACTIONS, self.state.step]) for seed in self.group.seeds]
@@ -160,11 +160,5 @@ class Loop:
 
 
 def hidden_steps(actor: Actor, delay: Delay) -> np.int32:
-    """Return how many of the newest steps a seed's learner may not use yet, because not all of them have arrived.
-
-    What is older than the longest delay has arrived, even if it was overtaken. A privileged learner may use all.
-    """
-    if actor.privileged:
-        return np.int32(0)
-    longest = delay.action.maximum + max(delay.observation.maximum, delay.reward.maximum)
-    return np.int32(min(len(actor.actions), longest))
+    """Return how many of the newest steps a seed's learner may not use yet; a privileged one may use all."""
+    return np.int32(0 if actor.privileged else min(len(actor.actions), delay.latest))

@@ -130,20 +130,20 @@ class Transit:
         self._ring[:] = self._idle
         self._rewards.start()
         self._actions.start()
-        self.draw_from(seed)
         self._truths[0], self._applied[0] = np.array(truth), 0
-        if self._fill == "first":
-            self._observations.start(0)
-            self._shown = 0
-        else:
-            self._observations.start()
-            self._shown = self._observations.send(0, self.random)
+        self.draw_from(seed)
 
     def draw_from(self, seed: int | None) -> None:
         """Draw the delays of an episode that has just begun from this seed; None goes on with the generator."""
         if seed is not None:
             self.random = np.random.default_rng([seed, 1])
         self.lag = self._actions.settle(self.random)
+        if self._fill == "first":
+            self._observations.start(0)
+            self._shown = 0
+        else:
+            self._observations.start()
+            self._shown = self._observations.send(0, self.random)
 
     def act(self, action: NDArray[Any]) -> NDArray[Any]:
         """Issue an action. Returns the one that acts now: the same array if it has no delay."""
