@@ -1,4 +1,7 @@
-"""The ladder of any-age: what each part brings, from the rows of the grid `any-age-ladder`; cells that have ended."""
+"""The ladder of any-age: what each part brings, from the rows of the grid `any-age-ladder`; cells that have ended.
+
+All arms have the seeds 0 to n - 1, and arms of one seed begin with the same networks and random actions.
+"""
 
 from pathlib import Path
 
@@ -74,19 +77,30 @@ def name(result: Result) -> str:
 
 
 def table(results: list[Result]) -> str:
-    """Return a Markdown table of the arms, compared with BPQL on the same SAC."""
-    base = next((area(r) for r in results if name(r) == f"`{BASE}`"), None)
-    head = ["arm", "seeds", "mean return over training", "times BPQL's", "difference, 95 % interval", "at the end"]
-    head += [f"seeds above {AWAY:,}", "GFLOP a step"]
+    """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms."""
+    areas = {name(r): area(r) for r in results}
+    base, whole = areas.get(f"`{BASE}`"), areas.get("`any-age`")
+    head = ["arm", "seeds", "mean return over training", "times BPQL's", "less BPQL's, 95 % interval"]
+    head += ["`any-age`'s less it, by seed", "at the end", f"seeds above {AWAY:,}", "GFLOP a step"]
     body = []
     for result in results:
-        own, final = area(result), result.curves.final
-        compared = base is not None and name(result) != f"`{BASE}`"
+        arm, final = name(result), result.curves.final
+        own, compared = areas[arm], base is not None and arm != f"`{BASE}`"
         times = f"{own.mean() / base.mean():.2f}" if compared and base is not None else ""
         apart = difference(own, base) if compared else ""
-        cells = [name(result), str(result.runs), spread(own), times, apart, spread(final)]
-        body.append([*cells, f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
+        changed = result.condition.agent == "any-age" and arm != "`any-age`" and whole is not None
+        cells = [arm, str(result.runs), spread(own), times, apart, paired(whole, own) if changed else ""]
+        body.append([*cells, spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
     return markdown_table(head, body)
+
+
+def paired(one: statistics.Floats, other: statistics.Floats) -> str:
+    """Write the mean difference over the seeds that both have, with its 95 % bootstrap interval."""
+    shared = min(one.size, other.size)
+    gaps = one[:shared] - other[:shared]
+    drawn = gaps[np.random.default_rng(0).integers(shared, size=(10_000, shared))].mean(1)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return f"{gaps.mean():+,.0f} ({low:+,.0f} to {high:+,.0f})"
 
 
 def draw(arms: list[tuple[str, Result]], out: Path) -> None:

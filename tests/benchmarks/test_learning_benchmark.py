@@ -60,7 +60,11 @@ def test_the_ladder_compares_with_bpql() -> None:
     own = ladder.area(arm).mean()
     assert float(cells[0][3]) == pytest.approx(own / 1100, abs=0.01)
     assert cells[0][4].startswith(f"+{own - 1100:,.0f} (")
-    assert cells[0][6:] == ["1 of 2", "1.23"]
+    assert cells[0][7:] == ["1 of 2", "1.23"]
     assert cells[1][3:5] == ["", ""]
     assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
+    whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
+    line = ladder.table([whole, arm, base]).splitlines()[3].strip("| ").split(" | ")
+    gaps = np.array([500.0, 100.0])  # a seed with its own; the third has no other
+    assert line[5] == f"{gaps.mean():+,.0f} (+100 to +500)"
     assert ladder.front([base]).splitlines()[2] == "| `bpql` | 25 |  | 1,100 ± 141 | 1,000 · 1,200 | 0 | 1.23 |"
