@@ -17,6 +17,8 @@ from delayrl.report.wording import number
 HEAD = ("case", "highest return", "not told apart from it", "lower", "not run yet")
 BUDGET = {"precision", "steps", "evaluate_every", "replay_capacity"}
 """Overrides that leave an agent what it is."""
+WAITING = "@wait"
+"""The end of a delay whose observations are held back for the longest one."""
 
 
 def section(files: list[Path]) -> str:
@@ -33,12 +35,19 @@ def lines(results: Iterable[Result]) -> list[list[str]]:
     """Return the cells of each line. Agents with other options than their preset's are left out."""
     plain = [r for r in results if not r.is_anchor and not r.condition.overrides.keys() - BUDGET]
     groups = [list(group) for _, group in groupby(sorted(plain, key=case), case)]
-    return [line(group) for group in groups if len({r.condition.agent for r in group if ended(r)}) > 1]
+    return [line(group) for group in groups if len({name(r) for r in group if ended(r)}) > 1]
 
 
 def case(result: Result) -> tuple[Any, ...]:
-    """Return what results must share to be compared."""
-    return result.place.env, delay_order(result.place.delay), result.place.setting, result.condition.steps
+    """Return what results must share to be compared. Who waits for the longest delay has the same plant."""
+    delay, place = result.place.delay, result.place
+    plant = delay.removesuffix(WAITING) if isinstance(delay, str) else delay
+    return place.env, delay_order(plant), place.setting, result.condition.steps
+
+
+def name(result: Result) -> str:
+    """Return the agent, marked if it waits."""
+    return result.condition.agent + (WAITING if str(result.place.delay).endswith(WAITING) else "")
 
 
 def ended(result: Result) -> bool:
@@ -48,14 +57,14 @@ def ended(result: Result) -> bool:
 
 def line(group: list[Result]) -> list[str]:
     """Return the cells of one case. An agent that several grids hold counts once, with most of its runs."""
-    most = {r.condition.agent: r for r in sorted(group, key=lambda r: (ended(r), r.runs))}
+    most = {name(r): r for r in sorted(group, key=lambda r: (ended(r), r.runs))}
     best, *others = sorted(filter(ended, most.values()), key=lambda r: (r.runs < FEWEST, -r.curves.final.mean()))
     parts: dict[bool, list[Result]] = {False: [], True: []}
     for other in others:
         low, _ = improvement_interval([(best.curves.final, other.curves.final)])
         parts[bool(low > 0.5)].append(other)
-    place, setting = best.place, best.place.setting
-    about = [place.env, f"delay {place.delay}", f"`{setting.preset}`", f"{best.condition.steps:,} steps"]
+    setting, plant = best.place.setting, str(best.place.delay).removesuffix(WAITING)
+    about = [best.place.env, f"delay {plant}", f"`{setting.preset}`", f"{best.condition.steps:,} steps"]
     about += [f"protocol `{setting.protocol}`"] if setting.protocol != "corrected" else []
     scored = (", ".join(map(score, part)) for part in ([best], parts[False], parts[True]))
     todo = ", ".join(f"`{agent}`" for agent, result in most.items() if not ended(result))
@@ -66,4 +75,4 @@ def score(result: Result) -> str:
     """Write an agent with its mean normalised return, or the raw one where an anchor is missing, and its runs."""
     mean = float(np.mean(result.final))
     value = f"{number(float(result.curves.final.mean()))} raw" if np.isnan(mean) else f"{mean:.2f}"
-    return f"`{result.condition.agent}` {value} ({result.runs})"
+    return f"`{name(result)}` {value} ({result.runs})"

@@ -51,6 +51,14 @@ def test_an_agent_is_lower_where_five_runs_a_side_say_so() -> None:
     ]
 
 
+def test_who_waits_is_compared_on_the_same_plant() -> None:
+    """And is told from the agent that takes each observation as it comes."""
+    late, waits = cell("bpql", LOW, "uniform:1:5"), cell("bpql", HIGH, "uniform:1:5@wait")
+    assert lines(late, waits) == [
+        ["Ant-v4, delay uniform:1:5, `paper`, 300 steps", "`bpql@wait` 12.0 raw (5)", "", "`bpql` 2.00 raw (5)", ""]
+    ]
+
+
 def test_one_high_run_makes_no_other_agent_lower() -> None:
     """The best by its mean, which loses nine of ten runs."""
     ((*_, best, apart, lower, _),) = lines(cell("vdpo", [100.0] + [0.0] * 9), cell("bpql", [5.0] * 10))
