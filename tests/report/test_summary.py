@@ -159,20 +159,22 @@ def test_a_failed_seed_beside_one_that_has_ended() -> None:
 
 
 def test_over_all_delays_conditions_are_counted() -> None:
-    """And an agent that was spared the long delays is not shown beside one that had them."""
-    longer = standing("vdpo", "delayrl/Ant-v4", 25, 2, steps=300)
-    cells = small() | {"bpql": standing("bpql", "delayrl/Ant-v4", 5, 2, steps=300)}
-    every = anchored(cells, vdpo=[[0.0, 0, 60], [0.0, 0, 60]], bpql=[[0.0, 0, 60], [0.0, 0, 60]])
-    every += curve(longer, 0, [0, 0, 30]) + curve(longer, 1, [0, 0, 30])
-    summary = summarise(every, [*cells.values(), longer])
-    counts = {(a.label, a.delay): (a.tasks, a.runs) for a in summary.aggregates}
-    assert counts == {
-        ("bpql", 5): (1, 2),
-        ("vdpo", 5): (1, 2),
-        ("vdpo", 25): (1, 2),
-        ("vdpo", None): (2, 4),
-    }
-    assert "2 conditions, 4 runs" in markdown(summary, "t", {})
+    """And an agent that was spared the long delays is not shown beside those that had them; nor is one left alone."""
+    late = [standing(agent, "delayrl/Ant-v4", 25, 2, steps=300) for agent in ("vdpo", "a-sac")]
+    early = {agent: standing(agent, "delayrl/Ant-v4", 5, 2, steps=300) for agent in ("bpql", "a-sac")}
+    cells = small() | early
+    every = anchored(cells, **{agent: [[0.0, 0, 60], [0.0, 0, 60]] for agent in ("vdpo", *early)})
+    longer = [curve(cell, seed, [0, 0, 30]) for cell in late for seed in range(2)]
+
+    def counts(rows: list[Any], more: list[Any]) -> dict[Any, tuple[int, int]]:
+        summary = summarise(every + [row for run in rows for row in run], [*cells.values(), *more])
+        assert ("2 conditions, 4 runs" in markdown(summary, "t", {})) == (len(more) == 2)
+        return {(a.label, a.delay): (a.tasks, a.runs) for a in summary.aggregates}
+
+    at_5 = {(agent, 5): (1, 2) for agent in ("bpql", "a-sac", "vdpo")}
+    at_25 = {(agent, 25): (1, 2) for agent in ("a-sac", "vdpo")}
+    assert counts(longer, late) == at_5 | at_25 | {("a-sac", None): (2, 4), ("vdpo", None): (2, 4)}
+    assert counts(longer[:2], late[:1]) == at_5 | {("vdpo", 25): (1, 2)}
 
 
 def test_cells_that_share_all_but_their_seeds_are_one_and_others_are_not_mixed() -> None:

@@ -85,14 +85,14 @@ class AnyAge:
         state = self.bpql.init(spec, key)
         if self.encoder == "mlp" or spec.delay == 0:
             return state
-        actor_key = jax.random.split(jax.random.fold_in(key, 1))[0]
+        actor_key = jax.random.split(jax.random.fold_in(key, 1))[0]  # a critic's too, but other draws of it
         if self.encoder == "forecast":
             actor = forecast_init(actor_key, spec, self.bpql.hidden, 2 * spec.action_size)
         else:
             sizes = self.encoder_width, self.encoder_layers, self.bpql.hidden, 2 * spec.action_size
             actor = sequence_init(actor_key, spec, *sizes)
         if self.belief_weight:
-            belief_key = jax.random.fold_in(key, 2)  # no key of BPQL's
+            belief_key = jax.random.fold_in(key, 2)
             actor["belief"] = networks.linear_init(belief_key, self.encoder_width, spec.obs_size)
         return state._replace(actor=actor, actor_opt_state=optax.adam(self.bpql.actor_learning_rate).init(actor))
 

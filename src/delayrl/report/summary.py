@@ -1,6 +1,6 @@
 """All that a report shows, computed from rows and cells. Cells are inferred where no grid names them."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -162,23 +162,26 @@ def _differing(cells: Sequence[Cell]) -> set[str]:
 def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
     """Aggregate the results of learners whose seeds have ended and whose task has both anchors.
 
-    Only agents with the same tasks can be compared: an agent that lacks a task of another's is left out.
+    Only agents with the same tasks can be compared: an agent that lacks a task of another's is left out, and one that
+    is then alone too.
     """
-    chosen: dict[tuple[Setting, int | str | None, str], list[Result]] = defaultdict(list)
+    chosen: dict[tuple[Setting, int | str | None], dict[str, list[Result]]] = defaultdict(lambda: defaultdict(list))
     for result in results:
         place = result.place
         if result.is_anchor or result.partial or not result.runs or np.isnan(result.final).any():
             continue
-        chosen[place.setting, place.delay, place.label].append(result)
-        if isinstance(place.delay, int):
-            chosen[place.setting, None, place.label].append(result)
-    delays = Counter(setting for setting, delay in {key[:2] for key in chosen} if isinstance(delay, int))
-    tasks_of = {key: {(result.place.env, result.place.delay) for result in own} for key, own in chosen.items()}
-    every: dict[Any, set[Any]] = defaultdict(set)
-    for (setting, delay, _), tasks in tasks_of.items():
-        every[setting, delay] |= tasks
-    keys = [key for key in chosen if (key[1] is not None or delays[key[0]] > 1) and tasks_of[key] == every[key[:2]]]
-    return sorted((_aggregate(*key, chosen[key]) for key in keys), key=_order)
+        for delay in (place.delay, None) if isinstance(place.delay, int) else (place.delay,):
+            chosen[place.setting, delay][place.label].append(result)
+    aggregates = []
+    for (setting, delay), results_of in chosen.items():
+        tasks_of = {label: {(r.place.env, r.place.delay) for r in own} for label, own in results_of.items()}
+        every = set().union(*tasks_of.values())
+        if delay is None and len({constant for _, constant in every}) == 1:
+            continue  # the same as at this delay
+        whole = [label for label, tasks in tasks_of.items() if tasks == every]
+        if len(whole) > 1 or len(results_of) == 1:
+            aggregates += [_aggregate(setting, delay, label, results_of[label]) for label in whole]
+    return sorted(aggregates, key=_order)
 
 
 def _aggregate(setting: Setting, delay: int | str | None, label: str, results: list[Result]) -> Aggregate:
