@@ -42,6 +42,7 @@ COLOURS = {
     "sac-memoryless": "#d1242f",
     "bpql": "#1a7f37",
     "a-sac": "#9a6700",
+    "any-age": "#8250df",
 }
 
 Curves = dict[str, dict[int, list[float]]]  # label -> step -> one mean return per seed
@@ -315,8 +316,10 @@ def main() -> None:
         "reference": "its reference, no delay",
         "sac-memoryless": "SAC without memory, delay 5",
     }
-    draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", words)
-    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | {"bpql": "BPQL, delay 5"})
+    more = {"bpql": "BPQL, delay 5"}
+    balanced = words | more | {"any-age": "any-age, delay 5"}
+    draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", balanced)
+    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | more)
     if (HERE / "results" / "pusher-random.jsonl").exists():
         labels = {agent: agent for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
         title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
