@@ -23,7 +23,12 @@ AWAY = 1_500
 BASE = "bpql"
 
 
-FRONT = {"`sac`, no delay": "#8c8c8c", "`any-age`": "#1f6feb", "`bpql`": "#1a7f37"}
+FRONT = {
+    "`sac`, no delay": "#8c8c8c",
+    "`any-age`": "#1f6feb",
+    "`bpql`, `critic_norm=layer`": "#9a6700",
+    "`bpql`": "#1a7f37",
+}
 """The arms on the first page, and their colours."""
 
 
@@ -54,7 +59,7 @@ def front(results: list[Result]) -> str:
         seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
         mean, within = result.final.mean(), interval(result.final_interval, normalised)
         score = "" if np.isnan(mean) else normalised(mean) + (f" ({within})" if within else "")
-        cells = [f"`{result.condition.agent}`", str(result.place.delay), score, spread(result.curves.final), seeds]
+        cells = [name(result), str(result.place.delay), score, spread(result.curves.final), seeds]
         body.append([*cells, f"{result.condition.steps:,}", gflop(result)])
     return markdown_table(head, body)
 
