@@ -87,8 +87,8 @@ def table(results: list[Result]) -> str:
     """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms."""
     areas = {name(r): area(r) for r in results}
     base, whole = areas.get(f"`{BASE}`"), areas.get("`any-age`")
-    head = ["arm", "seeds", "mean return over training", "times BPQL's", "less BPQL's, 95 % interval"]
-    head += ["`any-age`'s less it, by seed", "at the end", f"seeds above {AWAY:,}", "GFLOP a step"]
+    head = ["arm", "seeds", "over training", "times BPQL's", "less BPQL's"]
+    head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP"]
     body = []
     for result in results:
         arm, final = name(result), result.curves.final
