@@ -20,7 +20,7 @@ from delayrl.report.wording import interval, normalised
 
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,470."""
-BASE = "bpql"
+BASE, WHOLE = "`bpql`", "`any-age`"
 
 
 FRONT = {
@@ -86,16 +86,16 @@ def name(result: Result) -> str:
 def table(results: list[Result]) -> str:
     """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms."""
     areas = {name(r): area(r) for r in results}
-    base, whole = areas.get(f"`{BASE}`"), areas.get("`any-age`")
+    base, whole = areas.get(BASE), areas.get(WHOLE)
     head = ["arm", "seeds", "over training", "times BPQL's", "less BPQL's"]
     head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP"]
     body = []
     for result in results:
         arm, final = name(result), result.curves.final
-        own, compared = areas[arm], base is not None and arm != f"`{BASE}`"
+        own, compared = areas[arm], base is not None and arm != BASE
         times = f"{own.mean() / base.mean():.2f}" if compared and base is not None else ""
         apart = difference(own, base) if compared else ""
-        changed = result.condition.agent == "any-age" and arm != "`any-age`" and whole is not None
+        changed = result.condition.agent == "any-age" and arm != WHOLE and whole is not None
         cells = [arm, str(result.runs), spread(own), times, apart, paired(whole, own) if changed else ""]
         body.append([*cells, spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
     return markdown_table(head, body)

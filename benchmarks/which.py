@@ -40,14 +40,18 @@ def lines(results: Iterable[Result]) -> list[list[str]]:
 
 def case(result: Result) -> tuple[Any, ...]:
     """Return what results must share to be compared. Who waits for the longest delay has the same plant."""
-    delay, place = result.place.delay, result.place
-    plant = delay.removesuffix(WAITING) if isinstance(delay, str) else delay
-    return place.env, delay_order(plant), place.setting, result.condition.steps
+    return result.place.env, delay_order(plant(result)), result.place.setting, result.condition.steps
+
+
+def plant(result: Result) -> int | str:
+    """Return the delay, without the rule to wait."""
+    delay = result.place.delay
+    return delay.removesuffix(WAITING) if isinstance(delay, str) else delay
 
 
 def name(result: Result) -> str:
     """Return the agent, marked if it waits."""
-    return result.condition.agent + (WAITING if str(result.place.delay).endswith(WAITING) else "")
+    return result.condition.agent + (WAITING if plant(result) != result.place.delay else "")
 
 
 def ended(result: Result) -> bool:
@@ -63,8 +67,8 @@ def line(group: list[Result]) -> list[str]:
     for other in others:
         low, _ = improvement_interval([(best.curves.final, other.curves.final)])
         parts[bool(low > 0.5)].append(other)
-    setting, plant = best.place.setting, str(best.place.delay).removesuffix(WAITING)
-    about = [best.place.env, f"delay {plant}", f"`{setting.preset}`", f"{best.condition.steps:,} steps"]
+    setting = best.place.setting
+    about = [best.place.env, f"delay {plant(best)}", f"`{setting.preset}`", f"{best.condition.steps:,} steps"]
     about += [f"protocol `{setting.protocol}`"] if setting.protocol != "corrected" else []
     scored = (", ".join(map(score, part)) for part in ([best], parts[False], parts[True]))
     todo = ", ".join(f"`{agent}`" for agent, result in most.items() if not ended(result))

@@ -85,7 +85,7 @@ class AnyAge:
         state = self.bpql.init(spec, key)
         if self.encoder == "mlp" or spec.delay == 0:
             return state
-        actor_key = jax.random.split(jax.random.fold_in(key, 1))[0]  # a critic's too, but other draws of it
+        actor_key = jax.random.split(jax.random.fold_in(key, 1))[0]  # also a key of BPQL's critics
         if self.encoder == "forecast":
             actor = forecast_init(actor_key, spec, self.bpql.hidden, 2 * spec.action_size)
         else:

@@ -71,9 +71,11 @@ class DIDA:
         return self.reference, state.reference
 
     def for_run(self, schedule: Schedule) -> "DIDA":
-        """Return the agent. Raises DelayRLError unless the expert finishes between the random steps and the end.
+        """Return the agent.
 
-        And for running moments, which would go on to change what the frozen expert sees.
+        Raises:
+            DelayRLError: the expert does not finish between the random steps and the end, or observations are
+                normalised: their moments would still move what the frozen expert sees.
         """
         if schedule.observation_norm != "none":
             raise DelayRLError(f"dida takes observation_norm none; got {schedule.observation_norm}")
