@@ -24,7 +24,7 @@ def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = 
         lines.append({"run": number, "config": run.config, "steps_per_second": speed})
         lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.rows()]
         if episodes:
-            lines.append({"run": number, "evaluation": evaluate(path, episodes)})
+            lines.append({"run": number, "evaluation": evaluate(path, episodes, seed=run.config["seed"])})
         if episodes and every_delay:
             lines += [{"run": number, "sweep": result} for result in sweep(path, episodes)]
     out.parent.mkdir(parents=True, exist_ok=True)

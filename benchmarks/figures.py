@@ -38,7 +38,7 @@ from delayrl.training.cost import cost_of
 HERE = Path(__file__).parent
 COLOURS = {
     "vdpo": "#1f6feb",
-    "reference": "#8c8c8c",
+    "vdpo reference": "#8c8c8c",
     "sac-memoryless": "#d1242f",
     "bpql": "#1a7f37",
     "a-sac": "#9a6700",
@@ -56,12 +56,12 @@ def read(name: str) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]], li
 
 
 def curves(name: str) -> Curves:
-    """Return the mean returns of each seed's evaluations, by agent; VDPO's reference has a label of its own."""
+    """Return the mean returns of each seed's evaluations, by agent; an agent's reference has a label of its own."""
     configs, rows, _ = read(name)
     episodes: dict[tuple[str, int, int], list[float]] = defaultdict(list)
     for row in rows:
         agent = configs[row["run"]]["agent"]
-        label = agent if row["policy"] == "agent" else "reference"
+        label = agent if row["policy"] == "agent" else f"{agent} {row['policy']}"
         episodes[label, row["step"], row["run"]].append(row["return"])
     result: Curves = defaultdict(lambda: defaultdict(list))
     for (label, step, _), returns in sorted(episodes.items()):
@@ -313,7 +313,7 @@ def main() -> None:
     measured(images / "measure.png")
     words = {
         "vdpo": "VDPO, delay 5",
-        "reference": "its reference, no delay",
+        "vdpo reference": "its reference, no delay",
         "sac-memoryless": "SAC without memory, delay 5",
     }
     more = {"bpql": "BPQL, delay 5"}
@@ -353,8 +353,9 @@ def main() -> None:
         insert(root / "docs" / "benchmarks.md", "learning", text)
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("any-age-ladder", "any-age-crossq")]
     if rows := [file for file in rows if file.exists()]:
-        arms, front = ladder.sections(rows, images)
+        arms, goals, front = ladder.sections(rows, images)
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
+        insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
         for page in ("README.md", "docs/index.md"):
             insert(root / page, "halfcheetah", front)
     if forecast.OUT.exists():

@@ -4,7 +4,11 @@ All arms have the seeds 0 to n - 1. Arms of one seed begin with the same random 
 have one encoder.
 """
 
+import contextlib
+import json
+import sqlite3
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from learning.curves import curve, difference, spread
@@ -21,6 +25,15 @@ from delayrl.report.wording import interval, normalised
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,470."""
 BASE, WHOLE = "`bpql`", "`any-age`"
+GOALS = [
+    (WHOLE, "`bpql`, its released settings", "1.5"),
+    (WHOLE, BASE, ""),
+    (WHOLE, "`bpql`, `critic_norm=layer`", "1.15"),
+    ("`any-age`, `critic_norm=none`", BASE, "1.15"),
+    (WHOLE, "`sac`, no delay, `critic_norm=layer`", "0.75"),
+    (WHOLE, "`sac`, no delay", ""),
+]
+"""Two arms, and the ratio of their returns that was aimed at before the grid ran."""
 
 
 FRONT = {
@@ -32,23 +45,30 @@ FRONT = {
 """The arms on the first page, and their colours."""
 
 
-def sections(files: list[Path], pictures: Path) -> tuple[str, str]:
-    """Draw the curves; return the table of all arms, and that of the first page, with what made them."""
-    files_read, results = [read_table(file) for file in files], []
-    for collected in files_read:
+def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
+    """Draw the curves; return the tables of all arms, of the goals, and of the first page, with what made them."""
+    results: list[Result] = []
+    for collected in map(read_table, files):
         cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw([(f"C{number % 10}", r) for number, r in enumerate(learners)], pictures / "ladder.png")
     shown = [r for r in learners if name(r) in FRONT]
     draw([(FRONT[name(r)], r) for r in shown], pictures / "halfcheetah.png")
-    every = [used for collected in files_read for used in collected.versions]
+    every = [used for file in files for used in versions_of(file)]
     words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
     rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
     made = "HalfCheetah-v5, preset `matched` with `--precision bfloat16`. ± is the standard deviation over seeds, each "
     made += f"of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
-    return f"{table(learners)}\n\n{made} Commits: {commits}.", f"{front(shown)}\n\n{made}"
+    return f"{table(learners)}\n\n{made} Commits: {commits}.", goals(learners), f"{front(shown)}\n\n{made}"
+
+
+def versions_of(file: Path) -> list[dict[str, Any]]:
+    """Return what the cells of a table that have ended were trained with."""
+    query = "SELECT versions FROM runs JOIN cells ON cells.id = runs.cell WHERE state = 'done' ORDER BY cells.number"
+    with contextlib.closing(sqlite3.connect(file)) as table:
+        return [used for (text,) in table.execute(query) for used in json.loads(text)]
 
 
 def front(results: list[Result]) -> str:
@@ -85,20 +105,39 @@ def name(result: Result) -> str:
 
 def table(results: list[Result]) -> str:
     """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms."""
-    areas = {name(r): area(r) for r in results}
-    base, whole = areas.get(BASE), areas.get(WHOLE)
+    arms = {name(r): r for r in results}
+    base, whole = arms.get(BASE), arms.get(WHOLE)
     head = ["arm", "seeds", "over training", "times BPQL's", "less BPQL's"]
     head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP"]
     body = []
     for result in results:
-        arm, final = name(result), result.curves.final
-        own, compared = areas[arm], base is not None and arm != BASE
-        times = f"{own.mean() / base.mean():.2f}" if compared and base is not None else ""
-        apart = difference(own, base) if compared else ""
-        changed = result.condition.agent == "any-age" and arm != WHOLE and whole is not None
-        cells = [arm, str(result.runs), spread(own), times, apart, paired(whole, own) if changed else ""]
+        arm, own, final = name(result), area(result), result.curves.final
+        cells = [arm, str(result.runs), spread(own)]
+        cells += [times(result.area, base.area), difference(own, area(base))] if base and arm != BASE else ["", ""]
+        changed = whole and result.condition.agent == "any-age" and arm != WHOLE
+        cells += [paired(area(whole), own) if whole and changed else ""]
         body.append([*cells, spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
     return markdown_table(head, body)
+
+
+def goals(results: list[Result]) -> str:
+    """Return a Markdown table of any-age's returns over those of other arms, beside what was to be reached."""
+    arms = {name(r): r for r in results}
+    head = ["arm", "over", "goal", "over training", "difference", "at the end", "difference"]
+    body = []
+    for one, other, goal in GOALS:
+        if one in arms and other in arms:
+            x, y = arms[one], arms[other]
+            training = [times(x.area, y.area), difference(area(x), area(y))]
+            end = [times(x.final, y.final), difference(x.curves.final, y.curves.final)]
+            body.append([one, other, goal and f"≥ {goal}", *training, *end])
+    return markdown_table(head, body)
+
+
+def times(one: statistics.Floats, other: statistics.Floats) -> str:
+    """Write the ratio of two mean normalised returns, so above the random policy's; empty where anchors are missing."""
+    ratio = one.mean() / other.mean()
+    return "" if np.isnan(ratio) else f"{ratio:.2f}"
 
 
 def paired(one: statistics.Floats, other: statistics.Floats) -> str:

@@ -42,6 +42,27 @@ class Camera(gym.ObservationWrapper):
         return {"arm": {"double": np.array([2 * x, 2 * x]), "position": x}, "bias": np.array([self.offset])}
 
 
+class Wind(gym.Env):
+    """docs/theory.md, section 9: from the sky 3 to the place 0, from -2 to 1 or -1; the reward is a at 0, else -a."""
+
+    observation_space = Box(-4, 4, (1,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.place = self.np_random.choice([3, -2])
+        return np.array([self.place], np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        reward, place = 0.0, self.place
+        if place in (0, 1, -1):
+            reward = float(action[0] if place == 0 else -action[0])
+            self.place = self.np_random.choice([3, -2])
+        else:
+            self.place = 0 if place == 3 else self.np_random.choice([1, -1])
+        return np.array([self.place], np.float32), reward, False, False, {}
+
+
 def make_arm(**kwargs: Any) -> gym.Env:
     return TimeLimit(Arm(**kwargs), 20)
 

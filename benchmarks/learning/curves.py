@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from scipy import stats
 
 from delayrl.report import statistics
 
@@ -38,6 +39,7 @@ def read(folder: Path) -> tuple[Runs, list[str]]:
             used = line.get("versions") or line["config"]["versions"]
             packages = ("jax", "torch", "stable-baselines3", "sbx-rl", "mujoco", "gymnasium")
             words = ", ".join(f"{package} {used[package]}" for package in packages if used.get(package))
+            words += f", commit {used['commit'] or 'unknown'}" if "commit" in used else ""
             versions[name(line["config"])].add(f"{words}; {used['cores']} x86 cores")
     return runs, [f"{who}: {'; '.join(sorted(words))}" for who, words in sorted(versions.items())]
 
@@ -79,12 +81,10 @@ def spread(values: statistics.Floats) -> str:
 
 
 def difference(one: statistics.Floats, other: statistics.Floats | None) -> str:
-    """Write the difference of the means with a 95 % bootstrap interval over the seeds of both."""
+    """Write the difference of the means with its 95 % interval, by Welch's t."""
     if other is None or min(one.size, other.size) < 2:
         return ""
-    random = np.random.default_rng(0)
-    drawn = [x[random.integers(x.size, size=(10_000, x.size))].mean(1) for x in (one, other)]
-    low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5])
+    low, high = stats.ttest_ind(one, other, equal_var=False).confidence_interval()
     return f"{one.mean() - other.mean():+,.0f} ({low:+,.0f} to {high:+,.0f})"
 
 

@@ -3,11 +3,12 @@
 Sides are our agents by name; `sb3` and `sbx`, those libraries' SAC with their defaults on `AugmentedObservation`; and
 `released`, VDPO's code with its own sizes and evaluation (`--code PATH`). Each runs in an environment that has it; all
 but `released` need delayrl there, whose wrappers import without JAX. The clock runs from the start of training,
-compiling included, and stands still while a policy is evaluated.
+compiling included (ours keeps no compiled programs), and stands still while a policy is evaluated.
 """
 
 import argparse
 import json
+import os
 import sys
 import tempfile
 import time
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from peer import play, versions
+from peer import EVALUATION, play, reset_seed, versions
 
 EPISODES = 10
 PACKAGES = ("delayrl", "gymnasium", "jax", "mujoco", "numpy", "sbx-rl", "stable-baselines3", "torch")
@@ -62,7 +63,8 @@ def main() -> None:
     parser.add_argument("--code", help="a checkout of VDPO's released code")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    words = "-".join([given.side, *given.set, given.env, f"delay{given.delay}", f"seed{given.seed}"])
+    own = [] if given.side in SIDES else [given.preset, *given.set]
+    words = "-".join([given.side, *own, given.env, f"delay{given.delay}", f"seed{given.seed}"])
     out = given.out / f"{words}.jsonl"
     if out.exists():
         print(f"{out} is there already")
@@ -78,8 +80,7 @@ def main() -> None:
         print(f"{words}: {step:,} steps, {clock.seconds:,.0f} s{shown}", flush=True)
         return clock.seconds > 60 * given.minutes
 
-    sides = {"sb3": library, "sbx": library, "released": released}
-    sides.get(given.side, ours)(given, clock, record)
+    SIDES.get(given.side, ours)(given, clock, record)
     draft = out.with_suffix(".draft")
     draft.write_text("".join(json.dumps(line) + "\n" for line in lines))
     draft.rename(out)
@@ -87,12 +88,16 @@ def main() -> None:
 
 def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
     """Train one of our agents."""
+    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "0"
+    import jax
+
     import delayrl
     from delayrl.training.recorder import Recorder
 
     evaluate = Recorder.evaluate
 
     def timed(self: Recorder, *values: Any) -> str:
+        jax.block_until_ready(jax.live_arrays())  # updates that were called and not waited for
         with clock.paused():
             return evaluate(self, *values)
 
@@ -118,7 +123,7 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
 
 
 def library(given: argparse.Namespace, clock: Clock, record: Record) -> None:
-    """Train the SAC of Stable-Baselines3 or SBX on the newest observation and the actions since."""
+    """Train the SAC of Stable-Baselines3 or SBX on the newest observation and the actions since, with its defaults."""
     import gymnasium
 
     from delayrl.wrappers import AugmentedObservation, Delayed
@@ -138,7 +143,7 @@ def library(given: argparse.Namespace, clock: Clock, record: Record) -> None:
     for step in range(given.evaluate_every, NEVER, given.evaluate_every):
         model.learn(given.evaluate_every, reset_num_timesteps=False)
         with clock.paused():
-            value = np.mean(play(model, envs, [1_000_000 + 1_000 * given.seed + i for i in range(EPISODES)]))
+            value = np.mean(play(model, envs, [reset_seed(given.seed, EVALUATION, step, i) for i in range(EPISODES)]))
         if record(step, float(value)):
             return
 
@@ -184,6 +189,10 @@ def released(given: argparse.Namespace, clock: Clock, record: Record) -> None:
 
 class TimeOverError(Exception):
     """The given time is over."""
+
+
+SIDES = {"sb3": library, "sbx": library, "released": released}
+"""The sides that are not ours."""
 
 
 if __name__ == "__main__":

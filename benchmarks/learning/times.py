@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import pyplot
 
+from delayrl.report.markdown import markdown_table
+
 RETURNS = (1_000, 2_000, 3_000)
 NAMES = {"sb3": "SAC of Stable-Baselines3", "sbx": "SAC of SBX", "released": "VDPO, released code"}
 COLOURS = ("#1f6feb", "#1a7f37", "#8250df", "#c07ff0", "#9a6700", "#d1242f", "#8c8c8c")
@@ -19,7 +21,7 @@ class Run(NamedTuple):
     steps: list[int]
     seconds: list[float]
     returns: list[float]
-    end: tuple[int, float]  # steps and seconds of the whole run
+    given: float  # minutes that it was given
 
 
 Runs = dict[int, dict[str, list[Run]]]  # delay -> side -> one run for each seed
@@ -34,7 +36,7 @@ def read(folder: Path) -> tuple[Runs, list[dict[str, Any]]]:
         config = head["config"]
         evaluated = [line for line in lines if line["return"] is not None]
         columns = ([line[name] for line in evaluated] for name in ("step", "seconds", "return"))
-        runs[config["delay"]][name(config)].append(Run(*columns, (lines[-1]["step"], lines[-1]["seconds"])))
+        runs[config["delay"]][name(config)].append(Run(*columns, config["minutes"]))
         heads.append(head)
     return runs, heads
 
@@ -53,28 +55,40 @@ def reached(run: Run, value: float) -> tuple[int, float] | None:
 
 
 def cell(runs: list[Run], value: float) -> str:
-    """Write the median minutes and steps of the seeds that reach a return, and how many do if not all."""
-    ends = [end for run in runs if (end := reached(run, value))]
-    if not ends:
-        return "–"
-    steps, seconds = (np.median([end[i] for end in ends]) for i in range(2))
-    share = "" if len(ends) == len(runs) else f"; {len(ends)} of {len(runs)} seeds"
-    return f"{seconds / 60:.1f} min ({steps:,.0f} steps{share})"
+    """Write the median minutes and steps to a return, and how many seeds reach it; a dash where half of them do not."""
+    ends = [reached(run, value) or (np.inf, np.inf) for run in runs]
+    found = int(np.isfinite(ends).all(1).sum())
+    steps, seconds = np.median(ends, axis=0)
+    share = "" if found in (0, len(runs)) else f"{found} of {len(runs)} seeds"
+    if not np.isfinite(seconds):
+        return f"– ({share})" if share else "–"
+    return f"{seconds / 60:.1f} min ({steps:,.0f} steps{'; ' * bool(share)}{share})"
+
+
+def after(run: Run, minutes: float) -> float:
+    """Return the mean return of the last evaluation within so many minutes; NaN if there is none."""
+    known = [mean for seconds, mean in zip(run.seconds, run.returns, strict=True) if seconds <= 60 * minutes]
+    return known[-1] if known else np.nan
+
+
+def speed(run: Run) -> float:
+    """Return the steps a second between the first evaluation and the last: while it learns. NaN with only one."""
+    if len(run.steps) < 2:
+        return np.nan
+    return (run.steps[-1] - run.steps[0]) / (run.seconds[-1] - run.seconds[0])
 
 
 def table(runs: Runs) -> str:
     """Return a Markdown table of the time to each return, by delay and side."""
-    head = ["Δ", "side", "seeds", *(f"{value:,}" for value in RETURNS), "at the end", "minutes", "steps a second"]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    least = min(run.given for sides in runs.values() for own in sides.values() for run in own)
+    head = ["Δ", "side", "seeds", *(f"{value:,}" for value in RETURNS), f"after {least:.0f} minutes", "steps a second"]
+    body = []
     for delay, sides in sorted(runs.items()):
         for side, own in sorted(sides.items()):
-            last = [run.returns[-1] for run in own if run.returns]
-            speed = np.median([steps / seconds for steps, seconds in (run.end for run in own)])
+            last, fast = np.mean([after(run, least) for run in own]), np.median([speed(run) for run in own])
             cells = [str(delay), side, str(len(own)), *(cell(own, value) for value in RETURNS)]
-            cells += [f"{np.mean(last):,.0f}" if last else "–"]
-            cells += [f"{np.median([run.end[1] for run in own]) / 60:.0f}", f"{speed:,.1f}"]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            body.append([*cells, *("–" if np.isnan(x) else f"{x:,.{n}f}" for x, n in ((last, 0), (fast, 1)))])
+    return markdown_table(head, body)
 
 
 def draw(runs: Runs, out: Path) -> None:

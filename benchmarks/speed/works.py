@@ -37,20 +37,30 @@ CHEETAH = "HalfCheetah-v5"
 _LOCKSTEP = {"ours": ours("vdpo", "small", 5, seeds=4), "peer": ours("vdpo", "small", 5)}
 
 
-def _vdpo(delay: int) -> dict[str, Any]:
-    return {"ours": ours("vdpo", delay=delay), "peer": peer("vdpo", delay)}
+_SHORT = {"cpu": 100, "gpu": 1000}
+
+
+def _vdpo(delay: int, steps: dict[str, int]) -> Work:
+    title = f"VDPO, preset `paper`, HalfCheetah-v5, Δ = {delay}; released code"
+    return Work(f"vdpo-{delay}", title, steps, {"ours": ours("vdpo", delay=delay), "peer": peer("vdpo", delay)})
+
+
+def _vdpo_ten(delay: int) -> Work:
+    title = f"VDPO, preset `paper`, HalfCheetah-v5, Δ = {delay}, ten seeds in lockstep; released code, one seed"
+    sides = {"ours": ours("vdpo", delay=delay, seeds=10), "peer": peer("vdpo", delay)}
+    return Work(f"vdpo-{delay}-ten", title, {"gpu": 1000}, sides)
 
 
 def _sac(kind: str) -> Work:
     names = {"sbx": "SBX", "sb3": "Stable-Baselines3", "cleanrl": "CleanRL"}
     title = f"SAC, 256 × 256, batch 256, HalfCheetah-v5; {names[kind]}"
-    return Work(f"sac-{kind}", title, {"cpu": 100}, {"ours": ours("sac"), "peer": peer(kind)})
+    return Work(f"sac-{kind}", title, _SHORT, {"ours": ours("sac"), "peer": peer(kind)})
 
 
-def _any_age(delay: int) -> Work:
-    title = f"any-age, preset `small`, HalfCheetah-v5, Δ = {delay}; BPQL, ours too"
-    sides = {"ours": ours("any-age", "small", delay), "peer": ours("bpql", "small", delay)}
-    return Work(f"any-age-{delay}", title, {"cpu": 100}, sides)
+def _any_age(delay: int, name: str = "any-age", words: str = "", **options: Any) -> Work:
+    title = f"any-age{words}, preset `small`, HalfCheetah-v5, Δ = {delay}; BPQL, ours too"
+    sides = {"ours": ours("any-age", "small", delay, **options), "peer": ours("bpql", "small", delay)}
+    return Work(f"{name}-{delay}", title, _SHORT, sides)
 
 
 def _bfloat16(name: str, title: str, steps: int, **side: Any) -> Work:
@@ -73,23 +83,23 @@ WORKS = {
         _sac("sb3"),
         _sac("sbx"),
         Work("lockstep", "VDPO, preset `small`, Δ = 5: 4 seeds in lockstep; one after another", {"cpu": 50}, _LOCKSTEP),
-        Work(
-            "vdpo-5",
-            "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5; released code",
-            {"cpu": 10, "gpu": 1000},
-            _vdpo(5),
-        ),
-        Work(
-            "vdpo-5-ten",
-            "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5, ten seeds in lockstep; released code, one seed",
-            {"gpu": 1000},
-            _vdpo(5) | {"ours": ours("vdpo", delay=5, seeds=10)},
-        ),
+        _vdpo(5, {"cpu": 10, "gpu": 1000}),
+        _vdpo_ten(5),
         _sac("cleanrl"),
         *(_any_age(delay) for delay in (25, 50)),
+        *(_any_age(delay, "any-age-mlp", " with `encoder=mlp`", encoder="mlp") for delay in (25, 50)),
+        Work(
+            "replay",
+            "SAC, preset `small`, HalfCheetah-v5, a replay of 1,000,000 rows; of 20,000 rows, ours too",
+            {"cpu": 100},
+            {"ours": ours("sac", "small"), "peer": ours("sac", "small") | {"capacity": 20_000}},
+        ),
         _bfloat16("sac", "SAC, 256 × 256, batch 256, HalfCheetah-v5", 100, agent="sac"),
         _bfloat16("vdpo-5", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5", 10, agent="vdpo", delay=5),
-        Work("vdpo-25", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 25; released code", {"cpu": 10}, _vdpo(25)),
+        _vdpo(25, {"cpu": 10, "gpu": 1000}),
+        _vdpo_ten(25),
+        _vdpo(50, {"gpu": 1000}),
+        _vdpo_ten(50),
     )
 }
 

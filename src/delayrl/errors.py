@@ -17,7 +17,7 @@ class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
 
 
-TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL")
+TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL", "scipy")
 """Modules that the extra `train` brings."""
 
 

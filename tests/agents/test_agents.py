@@ -33,7 +33,7 @@ def test_registry_is_tested() -> None:
 
 
 @pytest.mark.parametrize("name", list(AGENTS))
-@pytest.mark.parametrize("preset", ["paper", "small"])
+@pytest.mark.parametrize("preset", ["paper", "matched", "small"])
 def test_presets_are_whole(name: str, preset: str) -> None:
     """Every preset initialises for its task, and every hyperparameter says what it means."""
     agent, _ = AGENTS[name].presets[preset]

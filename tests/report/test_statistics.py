@@ -77,7 +77,7 @@ def test_bootstrap_agrees_with_every_possible_resample() -> None:
         for b in itertools.product(strata[1], repeat=3)
     ]
     low, high = s.stratified_bootstrap(sure(*strata), s.interquartile_mean, repetitions=40_000)
-    exact = np.percentile(every, [2.5, 97.5])
+    exact = np.percentile(every, s.expanded_percentiles([3, 3]))
     np.testing.assert_allclose([low, high], exact, atol=0.3)
 
 
@@ -85,7 +85,12 @@ def test_bootstrap_agrees_with_scipy() -> None:
     scores = np.random.default_rng(1).normal(size=30)
     low, high = s.stratified_bootstrap(sure(scores), s.interquartile_mean, repetitions=20_000)
     reference = stats.bootstrap(
-        (scores,), lambda x, axis: s.interquartile_mean(x), method="percentile", n_resamples=20_000, rng=2
+        (scores,),
+        lambda x, axis: s.interquartile_mean(x),
+        method="percentile",
+        confidence_level=1 - s.expanded_percentiles([30])[0] / 50,
+        n_resamples=20_000,
+        rng=2,
     ).confidence_interval
     np.testing.assert_allclose([low, high], [reference.low, reference.high], atol=0.03)
 
@@ -102,7 +107,7 @@ def test_anchors_are_resampled_with_the_runs() -> None:
     twice = [list(itertools.product(x, repeat=2)) for x in (returns, random, reference)]
     every = [(np.mean(x) - np.mean(r)) / (np.mean(df) - np.mean(r)) for x, r, df in itertools.product(*twice)]
     low, high = s.stratified_bootstrap([s.Stratum(random, reference, [returns])], mean, repetitions=40_000)
-    np.testing.assert_allclose([low, high], np.percentile(every, [2.5, 97.5]), atol=0.02)
+    np.testing.assert_allclose([low, high], np.percentile(every, s.expanded_percentiles([2])), atol=0.02)
 
 
 def test_conditions_of_one_task_share_its_anchors() -> None:
@@ -119,13 +124,28 @@ def test_no_interval_where_the_reference_may_be_worse_than_random() -> None:
     assert all(np.isnan(s.stratified_bootstrap([stratum], mean)))
 
 
-def test_bootstrap_covers_as_often_as_it_says() -> None:
+@pytest.mark.parametrize("runs", [5, 25])
+def test_bootstrap_covers_as_often_as_it_says(runs: int) -> None:
+    """The plain percentile interval of five runs covers a mean 84 times in 100."""
     random = np.random.default_rng(0)
-    hits = 0
-    for trial in range(200):
-        low, high = s.stratified_bootstrap(sure(random.normal(size=25), random.normal(3, 1, 25)), mean, 400, trial)
-        hits += low <= 1.5 <= high
-    assert 0.88 <= hits / 200 <= 0.99
+    hits = {2: 0, 1: 0}
+    for trial in range(400):
+        both = sure(random.normal(size=runs), random.normal(3, 1, runs))
+        for tasks, middle in ((2, 1.5), (1, 0)):
+            low, high = s.stratified_bootstrap(both[:tasks], mean, 2000, trial)
+            hits[tasks] += low <= middle <= high
+    for found in hits.values():
+        assert 0.90 <= found / 400 <= 0.98
+
+
+def test_percentiles_of_few_runs_are_expanded() -> None:
+    """Hesterberg's table: 95 % of five values end at the percentiles 0.1 and 99.9."""
+    low, high = s.expanded_percentiles([5])
+    assert low == pytest.approx(100 * stats.norm.cdf(-stats.t.ppf(0.975, 4) * math.sqrt(5 / 4)))
+    assert low + high == 100
+    assert s.expanded_percentiles([10_000])[0] == pytest.approx(2.5, abs=0.01)
+    assert s.expanded_percentiles([1, 1]) == (0, 100)
+    assert s.expanded_percentiles([5, 5])[0] > 4 * low  # two conditions know more of the spread than one
 
 
 def test_bootstrap_covers_a_normalised_mean_only_with_the_anchors_uncertainty() -> None:
@@ -155,9 +175,9 @@ def test_interval_of_steps_agrees_with_every_possible_resample() -> None:
         for a in itertools.product(range(3), repeat=3)
         for b in itertools.product(reference, repeat=2)
     )
-    assert s.bootstrap_steps(steps, curves, reference, 40_000) == (every[2], every[-3])  # of 108
-    assert every[2] == 20
-    assert every[-3] == math.inf
+    assert s.bootstrap_steps(steps, curves, reference, 40_000) == (every[0], every[-1])  # of 108; all, with three runs
+    assert every[0] == 20
+    assert every[-1] == math.inf
     assert s.bootstrap_steps(steps, curves + 100, reference) == (10, 10)
     assert s.bootstrap_steps(steps, curves - 100, reference) == (math.inf, math.inf)
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ import delayrl
 from conftest import quick
 from delayrl.agents.registry import AGENTS
 from delayrl.play.evaluation import evaluate
+from own_tasks import Wind
 
 QUICK = {
     "preset": "small",
@@ -68,6 +70,20 @@ def test_memoryless_does_not(tmp_path: Path) -> None:
     """The same budget without memory stays under 500."""
     options = {"env": "InvertedPendulum-v5", "delay": 5, "preset": "small", "progress": False}
     assert mean_return(tmp_path / "run", agent="sac-memoryless", **options) < 500
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("encoder", "least", "most"), [("forecast", -3, 3), ("mlp", 20, 25), ("transformer", 20, 25)])
+def test_a_mean_hides_the_wind(encoder: str, least: float, most: float, tmp_path: Path) -> None:
+    """One step late, any-age earns nothing by its forecast, and nearly all of 25 by an encoder that sees x_t."""
+
+    def task() -> gymnasium.Env:
+        return gymnasium.wrappers.TimeLimit(Wind(), 50)
+
+    options = QUICK | {"env": task, "delay": 1, "steps": 4000, "evaluate_every": 2000, "hidden": [64, 64]}
+    runs = delayrl.train("any-age", out=tmp_path / "run", seeds=3, encoder=encoder, **options)
+    for run in runs:
+        assert least < np.mean([row["return"] for row in run.rows() if row["step"] == 4000]) < most
 
 
 @pytest.mark.slow
