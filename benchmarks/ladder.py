@@ -7,6 +7,7 @@ have one encoder.
 import contextlib
 import json
 import sqlite3
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
 from delayrl.report.wording import interval, normalised
+from delayrl.run.condition import Condition
 
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,470."""
@@ -61,7 +63,8 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
     made = "HalfCheetah-v5, preset `matched` with `--precision bfloat16`. ± is the standard deviation over seeds, each "
     made += f"of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
-    return f"{table(learners)}\n\n{made} Commits: {commits}.", goals(learners), f"{front(shown)}\n\n{made}"
+    slower = update_times(files[0].parent / "arms.jsonl")
+    return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners), f"{front(shown)}\n\n{made}"
 
 
 def versions_of(file: Path) -> list[dict[str, Any]]:
@@ -95,29 +98,44 @@ def area(result: Result) -> statistics.Floats:
 
 
 def name(result: Result) -> str:
-    """Return the arm in words: the agent, its delay if none, its preset if another, and its options."""
-    condition = result.condition
-    words = [f"`{condition.agent}`", *(["no delay"] if result.place.delay == 0 else [])]
+    """Return the arm in words."""
+    return arm(result.condition)
+
+
+def arm(condition: Condition) -> str:
+    """Return an arm in words: the agent, its delay if none, its preset if another, and its options."""
+    words = [f"`{condition.agent}`", *(["no delay"] if condition.delay == 0 else [])]
     if condition.preset == "paper":
         return ", ".join([*words, "its released settings"])
     return ", ".join([*words, *(f"`{k}={v}`" for k, v in condition.overrides.items() if k != "precision")])
 
 
-def table(results: list[Result]) -> str:
-    """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms."""
-    arms = {name(r): r for r in results}
+def table(results: list[Result], slower: Mapping[str, float] | None = None) -> str:
+    """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms.
+
+    `slower` has the time of each arm's update over that of BPQL's.
+    """
+    arms, slower = {name(r): r for r in results}, slower or {}
     base, whole = arms.get(BASE), arms.get(WHOLE)
     head = ["arm", "seeds", "over training", "times BPQL's", "less BPQL's"]
-    head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP"]
+    head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP", "update over BPQL's"]
     body = []
     for result in results:
-        arm, own, final = name(result), area(result), result.curves.final
-        cells = [arm, str(result.runs), spread(own)]
-        cells += [times(result.area, base.area), difference(own, area(base))] if base and arm != BASE else ["", ""]
-        changed = whole and result.condition.agent == "any-age" and arm != WHOLE
+        own, final, other = area(result), result.curves.final, None if result is base else base
+        cells = [name(result), str(result.runs), spread(own)]
+        cells += [times(result.area, other.area), difference(own, area(other))] if other else ["", ""]
+        changed = whole and result.condition.agent == "any-age" and result is not whole
         cells += [paired(area(whole), own) if whole and changed else ""]
-        body.append([*cells, spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)])
+        cells += [spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
+        body.append([*cells, f"{slower[name(result)]:.2f}" if name(result) in slower else ""])
     return markdown_table(head, body)
+
+
+def update_times(file: Path) -> dict[str, float]:
+    """Return the median ratio of each arm's update to BPQL's over the rounds of arms.py; nothing without its rows."""
+    rows = [json.loads(line) for line in file.read_text().splitlines()[1:]] if file.exists() else []
+    known = {row["arm"]: np.array(row["ms"]) for row in rows}
+    return {arm: float(np.median(ms / known[BASE])) for arm, ms in known.items()}
 
 
 def goals(results: list[Result]) -> str:

@@ -64,13 +64,13 @@ def test_the_ladder_compares_with_bpql() -> None:
     """The mean of an arm's curves over that of BPQL's, and how many seeds got away."""
     base = result("bpql", 25, [[1000.0, 1000.0], [1200.0, 1200.0]])
     arm = result("any-age", 25, [[2000.0, 2000.0], [2400.0, 1400.0]], pull_weight=0.0)
-    lines = ladder.table([arm, base]).splitlines()[2:]
+    lines = ladder.table([arm, base], {"`any-age`, `pull_weight=0.0`": 1.5}).splitlines()[2:]
     cells = [line.strip("| ").split(" | ") for line in lines]
     assert cells[0][:2] == ["`any-age`, `pull_weight=0.0`", "2"]
     own = ladder.area(arm).mean()
     assert float(cells[0][3]) == pytest.approx((own + 100) / 1200, abs=0.01)  # above the random policy's -100
     assert cells[0][4].startswith(f"+{own - 1100:,.0f} (")
-    assert cells[0][7:] == ["1 of 2", "1.23"]
+    assert cells[0][7:] == ["1 of 2", "1.23", "1.50"]
     assert cells[1][3:5] == ["", ""]
     assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
     whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
