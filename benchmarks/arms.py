@@ -33,7 +33,7 @@ ROWS, TURN = 2_000, 20  # rows of the replay, updates of a turn
 
 
 def updates(condition: Condition) -> Callable[[], float]:
-    """Compile an arm's update. Returns a function that makes some, and says the processor seconds of a step's."""
+    """Compile an arm's update. What is returned makes TURN of them and says the processor seconds of a step."""
     c = condition
     setup = resolve(c.agent, c.env, c.delay, c.preset, c.protocol, c.overrides)
     spec = spec_of(make(c.env, c.delay, rescale=True))

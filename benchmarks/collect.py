@@ -26,7 +26,7 @@ def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = 
         if episodes:
             lines.append({"run": number, "evaluation": evaluate(path, episodes, seed=run.config["seed"])})
         if episodes and every_delay:
-            lines += [{"run": number, "sweep": result} for result in sweep(path, episodes)]
+            lines += [{"run": number, "sweep": result} for result in sweep(path, episodes, seed=run.config["seed"])]
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text("".join(json.dumps(line) + "\n" for line in lines))
 

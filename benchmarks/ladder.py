@@ -35,7 +35,7 @@ GOALS = [
     (WHOLE, "`sac`, no delay, `critic_norm=layer`", "0.75"),
     (WHOLE, "`sac`, no delay", ""),
 ]
-"""Two arms, and the ratio of their returns that was aimed at before the grid ran."""
+"""Two arms, and the ratio of their returns that is aimed at."""
 
 
 FRONT = {
@@ -121,9 +121,9 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
     head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP", "update over BPQL's"]
     body = []
     for result in results:
-        own, final, other = area(result), result.curves.final, None if result is base else base
+        own, final, other = area(result), result.curves.final, area(base) if base and base is not result else None
         cells = [name(result), str(result.runs), spread(own)]
-        cells += [times(result.area, other.area), difference(own, area(other))] if other else ["", ""]
+        cells += ["", ""] if other is None else [ratio(own, other, result), difference(own, other)]
         changed = whole and result.condition.agent == "any-age" and result is not whole
         cells += [paired(area(whole), own) if whole and changed else ""]
         cells += [spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
@@ -146,16 +146,16 @@ def goals(results: list[Result]) -> str:
     for one, other, goal in GOALS:
         if one in arms and other in arms:
             x, y = arms[one], arms[other]
-            training = [times(x.area, y.area), difference(area(x), area(y))]
-            end = [times(x.final, y.final), difference(x.curves.final, y.curves.final)]
+            training = [ratio(area(x), area(y), x), difference(area(x), area(y))]
+            end = [ratio(x.curves.final, y.curves.final, x), difference(x.curves.final, y.curves.final)]
             body.append([one, other, goal and f"≥ {goal}", *training, *end])
     return markdown_table(head, body)
 
 
-def times(one: statistics.Floats, other: statistics.Floats) -> str:
-    """Write the ratio of two mean normalised returns, so above the random policy's; empty where anchors are missing."""
-    ratio = one.mean() / other.mean()
-    return "" if np.isnan(ratio) else f"{ratio:.2f}"
+def ratio(one: statistics.Floats, other: statistics.Floats, result: Result) -> str:
+    """Write the ratio of two mean returns, each above the random policy's; empty if that has not run."""
+    low = result.random_anchor.value
+    return "" if np.isnan(low) else f"{(one.mean() - low) / (other.mean() - low):.2f}"
 
 
 def paired(one: statistics.Floats, other: statistics.Floats) -> str:

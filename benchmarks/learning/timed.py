@@ -2,7 +2,7 @@
 
 Sides are our agents by name; `sb3` and `sbx`, those libraries' SAC with their defaults on `AugmentedObservation`; and
 `released`, VDPO's code with its own sizes and evaluation (`--code PATH`). Each runs in an environment that has it; all
-but `released` need delayrl there, whose wrappers import without JAX. The clock runs from the start of training,
+but `released` need delayrl there, whose wrappers import without JAX. The clock runs from before the imports,
 compiling included (ours keeps no compiled programs), and stands still while a policy is evaluated.
 """
 

@@ -72,10 +72,10 @@ def after(run: Run, minutes: float) -> float:
 
 
 def speed(run: Run) -> float:
-    """Return the steps a second between the first evaluation and the last: while it learns. NaN with only one."""
+    """Return the steps a second between the last two evaluations; NaN with only one."""
     if len(run.steps) < 2:
         return np.nan
-    return (run.steps[-1] - run.steps[0]) / (run.seconds[-1] - run.seconds[0])
+    return (run.steps[-1] - run.steps[-2]) / (run.seconds[-1] - run.seconds[-2])
 
 
 def table(runs: Runs) -> str:

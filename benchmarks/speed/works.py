@@ -90,7 +90,7 @@ WORKS = {
         *(_any_age(delay, "any-age-mlp", " with `encoder=mlp`", encoder="mlp") for delay in (25, 50)),
         Work(
             "replay",
-            "SAC, preset `small`, HalfCheetah-v5, a replay of 1,000,000 rows; of 20,000 rows, ours too",
+            "SAC, preset `small`, HalfCheetah-v5, a replay with room for 1,000,000 rows; for 20,000, ours too",
             {"cpu": 100},
             {"ours": ours("sac", "small"), "peer": ours("sac", "small") | {"capacity": 20_000}},
         ),

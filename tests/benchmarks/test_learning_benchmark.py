@@ -34,6 +34,8 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     write(tmp_path, "bpql", 1, [0.0, 0.0, 0.0, 1200.0])
     write(tmp_path, "bpql", 2, [0.0, 0.0, 2400.0, 2400.0])
     write(tmp_path, "released", 0, [-5.0, None])
+    slow = times.Run([1000, 2000, 3000], [500.0, 560.0, 620.0], [0.0, 0.0, 0.0], 9.0)
+    assert times.speed(slow) == pytest.approx(1000 / 60)  # not before it learns
     text = times.section(tmp_path, tmp_path / "times.png")
     cells = {
         line.split(" | ")[1]: line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| 5")
@@ -82,6 +84,14 @@ def test_the_ladder_compares_with_bpql() -> None:
     assert ladder.front([bare]).splitlines()[2] == "| `bpql` | 25 |  | 1,100 ± 141 | 1,000 · 1,200 | 0 | 1.23 |"
 
 
+def test_update_times_are_paired_by_round(tmp_path: Path) -> None:
+    """The median of the rounds' ratios; a round that met other work met it on both sides."""
+    rows = [{"versions": {}}, {"arm": "`any-age`", "ms": [2.0, 4.0, 90.0]}, {"arm": "`bpql`", "ms": [1.0, 2.0, 30.0]}]
+    (tmp_path / "arms.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert ladder.update_times(tmp_path / "arms.jsonl") == {"`any-age`": 2.0, "`bpql`": 1.0}
+    assert ladder.update_times(tmp_path / "none.jsonl") == {}
+
+
 def test_the_goals_of_the_ladder() -> None:
     """Ratios above the random policy, and Welch's interval of the difference of raw returns."""
     base = result("bpql", 25, [[1000.0, 1000.0], [1200.0, 1200.0]])
@@ -89,4 +99,6 @@ def test_the_goals_of_the_ladder() -> None:
     (line,) = [line.strip("| ").split(" | ") for line in ladder.goals([whole, base]).splitlines()[2:]]
     assert line[:4] == ["`any-age`", "`bpql`", "", f"{(4500 + 100) / 1200:.2f}"]
     welch = stats.ttest_ind([2500.0, 1500, 9000], [1000.0, 1200], equal_var=False).confidence_interval()
+    bare = replace(base, reference_anchor=NO_ANCHOR)  # the released settings are of a preset without delay-free SAC
+    assert ladder.goals([whole, bare]) == ladder.goals([whole, base])
     assert line[6] == f"+{13000 / 3 - 1100:,.0f} ({welch.low:+,.0f} to {welch.high:+,.0f})"

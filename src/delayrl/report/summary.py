@@ -190,7 +190,7 @@ def _aggregate(setting: Setting, delay: int | str | None, label: str, results: l
     iqm = float(statistics.interquartile_mean(pooled))
     low, high = statistics.stratified_bootstrap(strata, statistics.interquartile_mean)
     profile = statistics.performance_profile(pooled, THRESHOLDS)
-    band = statistics.stratified_bootstrap(strata, lambda x: statistics.performance_profile(x, THRESHOLDS), 500)
+    band = statistics.stratified_bootstrap(strata, lambda x: statistics.performance_profile(x, THRESHOLDS))
     return Aggregate(setting, delay, label, iqm, float(low), float(high), len(results), pooled.size, profile, *band)
 
 
