@@ -57,7 +57,7 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
     draw([(f"C{number % 10}", r) for number, r in enumerate(learners)], pictures / "ladder.png")
     shown = [r for r in learners if name(r) in FRONT]
     draw([(FRONT[name(r)], r) for r in shown], pictures / "halfcheetah.png")
-    every = [used for file in files for used in versions_of(file)]
+    every = [used for file in files for used in trained_with(file)]
     words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
     rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
     made = "HalfCheetah-v5, preset `matched` with `--precision bfloat16`. ± is the standard deviation over seeds, each "
@@ -67,8 +67,8 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners), f"{front(shown)}\n\n{made}"
 
 
-def versions_of(file: Path) -> list[dict[str, Any]]:
-    """Return what the cells of a table that have ended were trained with."""
+def trained_with(file: Path) -> list[dict[str, Any]]:
+    """Return the versions, commits and hardware of a table's cells that have ended; `read_table` has those of all."""
     query = "SELECT versions FROM runs JOIN cells ON cells.id = runs.cell WHERE state = 'done' ORDER BY cells.number"
     with contextlib.closing(sqlite3.connect(file)) as table:
         return [used for (text,) in table.execute(query) for used in json.loads(text)]

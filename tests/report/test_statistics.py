@@ -139,7 +139,7 @@ def test_bootstrap_covers_as_often_as_it_says(runs: int) -> None:
 
 
 def test_percentiles_of_few_runs_are_expanded() -> None:
-    """Hesterberg's table: 95 % of five values end at the percentiles 0.1 and 99.9."""
+    """An interval of five runs ends at the percentiles 0.1 and 99.9, of very many at 2.5 and 97.5."""
     low, high = s.expanded_percentiles([5])
     assert low == pytest.approx(100 * stats.norm.cdf(-stats.t.ppf(0.975, 4) * math.sqrt(5 / 4)))
     assert low + high == 100
