@@ -1,4 +1,4 @@
-"""Where and how the process computes: its device, and large update buffers that stay resident (docs/performance.md)."""
+"""Where and how the process computes: its device, and update buffers that stay resident (docs/performance.md)."""
 
 import ctypes
 import sys
@@ -14,31 +14,32 @@ from delayrl.errors import DelayRLError
 from delayrl.training.products import follow, traced_updates
 
 LARGE = 50 * 2**20
-"""Bytes of an update's matrix products from which keeping the buffers is faster (measured).
+"""Bytes of an update's matrix products from which computing on the main thread is faster (measured).
 
-XLA's allocation for such an update exceeds the 32 MB up to which glibc keeps a block by itself.
+XLA's allocation for such an update can exceed the 64 MB that glibc has room for in the heap of another thread.
 """
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
 
 def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
-    """Have the allocator keep the buffers of large updates. Call it before JAX looks for its devices.
+    """Have the allocator keep the buffers of updates. Call it before JAX looks for its devices.
 
-    XLA allocates an update's buffers at each call. glibc returns blocks above 32 MB to the system at once, so all
-    their pages are zeroed and mapped again: a sixth of an update's time. It keeps large blocks for the main thread
-    only, so updates then run there, instead of on a thread of JAX's. That gives up computing beside the host's work,
-    which costs small updates more than it saves.
+    XLA allocates an update's buffers at each call. glibc returns blocks above 32 MB to the system at once, and on
+    threads of JAX's also smaller ones. So all their pages are zeroed and mapped again: a sixth to a quarter of an
+    update's time. Asked to, it keeps blocks of up to 64 MB on any thread, larger ones on the main thread only. So large
+    updates run there. That gives up computing beside the host's work, which costs small updates more than it saves.
 
-    Returns whether buffers are kept from now on, in this process: never without glibc, off the main thread, or for
-    small updates. No result depends on it.
+    Returns whether updates run on the main thread from now on, in this process: never without a glibc that can be
+    asked (2.35), off the main thread, or for small updates. No result depends on it.
     """
-    if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is None or not mallopt(MMAP_THRESHOLD, 2**26):  # an old glibc accepts no more than 32 MB
         return False
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
+    mallopt(TRIM_THRESHOLD, 2**27)
+    on_main_thread = threading.current_thread() is threading.main_thread()
+    if not on_main_thread or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
         return False
-    if not mallopt(MMAP_THRESHOLD, 2**30):  # an old glibc, which accepts no more than 32 MB
-        return False
+    mallopt(MMAP_THRESHOLD, 2**30)
     mallopt(TRIM_THRESHOLD, 2**31 - 1)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     return True
