@@ -25,7 +25,7 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
     """Have the allocator keep the buffers of updates. Call it before JAX looks for its devices.
 
     XLA allocates an update's buffers at each call. glibc returns blocks above 32 MB to the system at once, and on
-    threads of JAX's also smaller ones. So all their pages are zeroed and mapped again: a sixth to a quarter of an
+    JAX's threads also smaller ones. So all their pages are zeroed and mapped again: a sixth to a quarter of an
     update's time. Asked to, it keeps blocks of up to 64 MB on any thread, larger ones on the main thread only. So large
     updates run there. That gives up computing beside the host's work, which costs small updates more than it saves.
 
