@@ -9,6 +9,7 @@ compiling included (ours keeps no compiled programs), and stands still while a p
 import argparse
 import json
 import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -71,7 +72,10 @@ def main() -> None:
         return
     given.out.mkdir(parents=True, exist_ok=True)
     config = {name: value for name, value in vars(given).items() if name not in ("out", "code")}
-    lines: list[dict[str, Any]] = [{"config": config, "versions": versions(PACKAGES)}]
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+    used = versions(PACKAGES) | {"commit": commit or None}
+    lines: list[dict[str, Any]] = [{"config": config, "versions": used}]
     clock = Clock()
 
     def record(step: int, value: float | None) -> bool:

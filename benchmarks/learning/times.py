@@ -11,7 +11,9 @@ from matplotlib import pyplot
 from delayrl.report.markdown import markdown_table
 
 RETURNS = (1_000, 2_000, 3_000)
+OURS = "`any-age`, `small`"
 NAMES = {"sb3": "SAC of Stable-Baselines3", "sbx": "SAC of SBX", "released": "VDPO, released code"}
+TICKS = (0.1, 0.3, 1, 3, 10, 30)
 COLOURS = ("#1f6feb", "#1a7f37", "#8250df", "#c07ff0", "#9a6700", "#d1242f", "#8c8c8c")
 
 
@@ -54,11 +56,16 @@ def reached(run: Run, value: float) -> tuple[int, float] | None:
     return (run.steps[found[0]], run.seconds[found[0]]) if found else None
 
 
+def median(runs: list[Run], value: float) -> tuple[float, float]:
+    """Return the median steps and seconds to a return over all seeds; infinite where half of them do not reach it."""
+    steps, seconds = np.median([reached(run, value) or (np.inf, np.inf) for run in runs], axis=0)
+    return steps, seconds
+
+
 def cell(runs: list[Run], value: float) -> str:
     """Write the median minutes and steps to a return, and how many seeds reach it; a dash where half of them do not."""
-    ends = [reached(run, value) or (np.inf, np.inf) for run in runs]
-    found = int(np.isfinite(ends).all(1).sum())
-    steps, seconds = np.median(ends, axis=0)
+    found = sum(reached(run, value) is not None for run in runs)
+    steps, seconds = median(runs, value)
     share = "" if found in (0, len(runs)) else f"{found} of {len(runs)} seeds"
     if not np.isfinite(seconds):
         return f"– ({share})" if share else "–"
@@ -91,6 +98,27 @@ def table(runs: Runs) -> str:
     return markdown_table(head, body)
 
 
+def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
+    """Write how many times as long as ours a side takes to a return; at least so many where half of its seeds fail."""
+    seconds, base = median(runs, value)[1], median(ours, value)[1]
+    if not np.isfinite(base):
+        return "–"
+    known = np.isfinite(seconds)
+    return f"{'' if known else '> '}{(seconds if known else 60 * min(run.given for run in runs)) / base:.1f}"
+
+
+def ratios(runs: Runs, ours: str) -> str:
+    """Return a Markdown table of every side's time to each return over that of `ours`."""
+    head = ["Δ", f"side, times as long as {ours}", *(f"{value:,}" for value in RETURNS)]
+    body = [
+        [str(delay), side, *(ratio(own, sides[ours], value) for value in RETURNS)]
+        for delay, sides in sorted(runs.items())
+        for side, own in sorted(sides.items())
+        if ours in sides and side != ours
+    ]
+    return markdown_table(head, body)
+
+
 def draw(runs: Runs, out: Path) -> None:
     """Draw return against minutes: a thin line for each seed in its side's colour, a panel for each delay."""
     figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 4.2), layout="constrained", squeeze=False)
@@ -101,6 +129,8 @@ def draw(runs: Runs, out: Path) -> None:
                 label = side.replace("`", "") if i == 0 else None
                 axes.plot(np.array(run.seconds) / 60, run.returns, color=colour, linewidth=1.4, label=label)
         axes.set(xlabel="minutes of training", ylabel="return", title=f"Δ = {delay}", xscale="log")
+        axes.set_xticks(TICKS, [str(tick) for tick in TICKS])
+        axes.set_xticks([], minor=True)
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
@@ -114,4 +144,4 @@ def section(folder: Path, picture: Path) -> str:
     draw(runs, picture)
     tasks = ", ".join(sorted({head["config"]["env"] for head in heads}))
     made = sorted({f"{key} {value}" for head in heads for key, value in head["versions"].items() if value})
-    return f"{table(runs)}\n\n{tasks}. Made with {', '.join(made)}. Rows: `benchmarks/results/times/`."
+    return f"{table(runs)}\n\n{ratios(runs, OURS)}\n\n{tasks}. Made with {', '.join(made)}. Rows: `benchmarks/results/times/`."

@@ -47,6 +47,10 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     assert "after 3 minutes" in text
     late = [times.Run([1], [60.0], [value], 3.0) for value in (0.0, 0.0, 3000.0)]
     assert times.cell(late, 1000) == "– (1 of 3 seeds)"
+    fast = [times.Run([1], [24.0], [3000.0], 3.0)]
+    assert [times.ratio(late, fast, 1000), times.ratio(fast, late, 1000)] == ["> 7.5", "–"]
+    pairs = {"ours": fast, "slow": [times.Run([1], [60.0], [1500.0], 3.0)]}
+    assert times.ratios({5: pairs}, "ours").splitlines()[2:] == ["| 5 | slow | 2.5 | > 7.5 | > 7.5 |"]
     assert (tmp_path / "times.png").stat().st_size > 5_000
 
 

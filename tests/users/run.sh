@@ -4,6 +4,7 @@ set -euo pipefail
 
 wheel=$(realpath "$1") place=$(realpath "$2") home=$(dirname "$(realpath "$0")")
 export JAX_COMPILATION_CACHE_DIR="$place/compiled" JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
+export XLA_FLAGS=${XLA_FLAGS---xla_backend_optimization_level=0} # compiling takes most of the time, as in the tests
 mkdir "$place/users"
 cp "$home"/*.py "$home/../../examples/ros2_node.py" "$place/users"
 cp -r "$home/package" "$place/package"
