@@ -144,4 +144,5 @@ def section(folder: Path, picture: Path) -> str:
     draw(runs, picture)
     tasks = ", ".join(sorted({head["config"]["env"] for head in heads}))
     made = sorted({f"{key} {value}" for head in heads for key, value in head["versions"].items() if value})
-    return f"{table(runs)}\n\n{ratios(runs, OURS)}\n\n{tasks}. Made with {', '.join(made)}. Rows: `benchmarks/results/times/`."
+    about = f"{tasks}. Made with {', '.join(made)}. Rows: `benchmarks/results/times/`."
+    return f"{table(runs)}\n\n{ratios(runs, OURS)}\n\n{about}"
