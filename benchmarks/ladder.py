@@ -105,8 +105,8 @@ def name(result: Result) -> str:
 def arm(condition: Condition) -> str:
     """Return an arm in words: the agent, its delay if none, its preset if another, and its options."""
     words = [f"`{condition.agent}`", *(["no delay"] if condition.delay == 0 else [])]
-    if condition.preset == "paper":
-        return ", ".join([*words, "its released settings"])
+    if condition.preset != "matched":
+        return ", ".join([*words, "its released settings" if condition.preset == "paper" else "preset `small`"])
     return ", ".join([*words, *(f"`{k}={v}`" for k, v in condition.overrides.items() if k != "precision")])
 
 

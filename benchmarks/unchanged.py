@@ -38,6 +38,8 @@ VDPO = "--width 8 --layers 2 --dropout 0.1 --clone-every 40 --clone-updates 5".s
 DIDA = ["--expert-steps", "240", "--round-steps", "40", "--imitation-updates", "5", "--student-hidden", "8", "8"]
 RUNS: dict[str, list[str]] = {
     "vdpo": ["vdpo", "--delay", "3", *SAC, *VDPO],
+    "any-age": ["any-age", "--delay", "3", *SAC],
+    "any-age-transformer": ["any-age", "--delay", "3", *SAC, "--encoder", "transformer", "--pull-weight", "1"],
     "lifting": ["lifting", "--delay", "3", *SAC, "--lifting-hold", "160", "--lifting-end", "400"],
     "ad-sac": ["ad-sac", "--delay", "3", *SAC],
     "dida": ["dida", "--delay", "3", *SAC, *DIDA],
@@ -70,8 +72,8 @@ DELAYS = (
     "choice:1=0.5,3=0.5",
     "2+action=1",
 )
-TABLES = ("first.sqlite", "updates-per-call.sqlite")
-GRIDS = ("smoke", "first", "paper-table1", "paper-table2", "paper-ablation", "paper-stochastic")
+TABLES = ("first.sqlite", "updates-per-call.sqlite", "any-age-ladder.sqlite")
+GRIDS = ("smoke", "first", "any-age-ladder", "paper-table1", "paper-table2", "paper-ablation", "paper-stochastic")
 
 
 def main() -> None:
@@ -92,9 +94,7 @@ def main() -> None:
     elif given.command == "stop":
         stop(given.folder)
     else:
-        compare(
-            json.loads((given.before / "facts.json").read_text()), json.loads((given.after / "facts.json").read_text())
-        )
+        compare(facts_of(given.before), facts_of(given.after))
 
 
 def record(folder: Path) -> None:

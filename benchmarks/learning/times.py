@@ -79,16 +79,18 @@ def after(run: Run, minutes: float) -> float:
 
 
 def speed(run: Run) -> float:
-    """Return the steps a second between the last two evaluations; NaN with only one."""
+    """Return the steps a second over the last quarter of the evaluations, where all sides learn; NaN with only one."""
     if len(run.steps) < 2:
         return np.nan
-    return (run.steps[-1] - run.steps[-2]) / (run.seconds[-1] - run.seconds[-2])
+    since = -1 - max(1, len(run.steps) // 4)
+    return (run.steps[-1] - run.steps[since]) / (run.seconds[-1] - run.seconds[since])
 
 
 def table(runs: Runs) -> str:
     """Return a Markdown table of the time to each return, by delay and side."""
     least = min(run.given for sides in runs.values() for own in sides.values() for run in own)
-    head = ["Δ", "side", "seeds", *(f"{value:,}" for value in RETURNS), f"after {least:.0f} minutes", "steps a second"]
+    ends = [f"after {least:.0f} minutes, or at the end", "steps a second"]
+    head = ["Δ", "side", "seeds", *(f"{value:,}" for value in RETURNS), *ends]
     body = []
     for delay, sides in sorted(runs.items()):
         for side, own in sorted(sides.items()):
@@ -99,12 +101,15 @@ def table(runs: Runs) -> str:
 
 
 def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
-    """Write how many times as long as ours a side takes to a return; at least so many where half of its seeds fail."""
-    seconds, base = median(runs, value)[1], median(ours, value)[1]
+    """Write how many times as long as ours a side takes to a return.
+
+    Where half of its seeds do not reach it, that is a lower bound: those count as if they had at their last evaluation.
+    """
+    base = median(ours, value)[1]
     if not np.isfinite(base):
         return "–"
-    known = np.isfinite(seconds)
-    return f"{'' if known else '> '}{(seconds if known else 60 * min(run.given for run in runs)) / base:.1f}"
+    least = np.median([(reached(run, value) or (0, run.seconds[-1]))[1] for run in runs])
+    return f"{'' if np.isfinite(median(runs, value)[1]) else '> '}{least / base:.1f}"
 
 
 def ratios(runs: Runs, ours: str) -> str:

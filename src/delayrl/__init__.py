@@ -59,6 +59,10 @@ __all__ = sorted(_HOME)
 watch_gymnasium()
 
 
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
+
+
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         try:

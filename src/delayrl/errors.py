@@ -46,7 +46,7 @@ ELSEWHERE = {
 
 def near_names(name: str, known: Iterable[str]) -> list[str]:
     """Return up to three known names that may be meant: by their name elsewhere, by initials, or by spelling."""
-    known, letters = list(known), name.strip("-").lower()
+    known, letters = list(dict.fromkeys(known)), name.strip("-").lower()
     ours = ELSEWHERE.get(letters.replace("-", "_"))
     if same := [other for other in known if ours and other.strip("-").replace("-", "_") == ours]:
         return same

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import runpy
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,10 @@ from conftest import TINY, learned, quick, record
 from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.random import Random
 from delayrl.agents.registry import AGENTS
-from delayrl.core.types import Seen, Spec
+from delayrl.core import views
+from delayrl.core.types import Seen, Spec, Window
+from delayrl.core.views import look
+from delayrl.errors import DelayRLError
 from delayrl.training.learner import AS_ONE, Learner, Stored
 
 PRIVILEGED = {name for name in DELAYED if TINY[name].privileged}
@@ -160,6 +164,19 @@ def test_learning_never_peeks(name: str) -> None:
     clean = trained(HONEST[name], 3, 1, hidden=3, transitions=transitions)[0].agent
     assert same(clean, trained(HONEST[name], 3, 1, hidden=3, transitions=poisoned)[0].agent)
     assert not same(clean, trained(HONEST[name], 3, 1, hidden=0, transitions=poisoned)[0].agent)
+
+
+def test_a_view_that_is_none_and_one_beyond_the_window() -> None:
+    """Both would train an agent that sees something else than its author thinks."""
+    unchecked = runpy.run_path(views.__file__)  # without the checks of types, which are the tests' own
+    with pytest.raises(DelayRLError, match="a network sees current, delayed, augmented; got 'augmentd'"):
+        unchecked["network_input"](Seen(jnp.ones(2), jnp.int32(1), jnp.ones((3, 1))), "augmentd")
+    rows, count = jnp.zeros(3 + 1 + 2), jnp.int32(0)
+    flags, ages = rows > 0, rows.astype(int)
+    window = Window(rows[:, None], ages, rows[:, None], rows, flags, flags, count, count, delay=3)
+    assert look(window, "current", 2).shape == (1,)
+    with pytest.raises(DelayRLError, match="windows reach 2 steps after t, as the agent's `ahead` says; got ahead=3"):
+        look(window, "augmented", 3)
 
 
 def test_random_is_uniform() -> None:

@@ -17,6 +17,7 @@ from delayrl.core.networks import mode
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
+from delayrl.run.condition import resolve
 from delayrl.training.learner import Program
 
 AGENT = DIDA(
@@ -136,12 +137,26 @@ def test_who_acts() -> None:
 def test_it_asks_for_what_it_needs() -> None:
     with pytest.raises(DelayRLError, match="at least 1 step"):
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
-    with pytest.raises(DelayRLError, match="a multiple of round_steps = 10; got 25"):
-        dataclasses.replace(AGENT, expert_steps=25).init(SPEC, jax.random.key(0))
     AGENT.for_run(Schedule(steps=21, random_steps=19))
     for schedule in (Schedule(steps=20, random_steps=5), Schedule(steps=40, random_steps=20)):
         with pytest.raises(DelayRLError, match="must lie between"):
             AGENT.for_run(schedule)
+    uneven = dataclasses.replace(AGENT, expert_steps=12)
+    with pytest.raises(DelayRLError, match=r"rounded up to whole rounds of 10, must lie between .* 5 and 20; got 12"):
+        uneven.for_run(Schedule(steps=20, random_steps=5))
+
+
+def test_the_expert_ends_with_a_round() -> None:
+    """Otherwise the student would act before its first update. Every length of a run can be asked for."""
+    assert [dataclasses.replace(AGENT, expert_steps=n).expert_end for n in (10, 11, 19, 20, 21)] == [10, 20, 20, 20, 30]
+    state, seen = parts()[0], Seen(jnp.ones(10), jnp.int32(2), jnp.zeros((3, 2)), jnp.ones(10))
+    uneven = dataclasses.replace(AGENT, expert_steps=12)
+    for steps in (12, 19, 20):
+        now = state._replace(steps=jnp.int32(steps))
+        key = jax.random.key(7)
+        np.testing.assert_array_equal(uneven.act(now, seen, key, explore=True), AGENT.act(now, seen, key, explore=True))
+    for steps in (5_000, 20_000, 25_001):
+        assert resolve("dida", "Reacher-v5", 3, "small", "corrected", {"steps": steps}).agent.expert_end % 250 == 0
 
 
 @pytest.mark.thorough

@@ -36,6 +36,8 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     write(tmp_path, "released", 0, [-5.0, None])
     slow = times.Run([1000, 2000, 3000], [500.0, 560.0, 620.0], [0.0, 0.0, 0.0], 9.0)
     assert times.speed(slow) == pytest.approx(1000 / 60)  # not before it learns
+    slowing = times.Run(list(range(8)), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0], [0.0] * 8, 9.0)
+    assert times.speed(slowing) == pytest.approx(2 / 4)  # the last quarter
     text = times.section(tmp_path, tmp_path / "times.png")
     cells = {
         line.split(" | ")[1]: line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| 5")
@@ -48,9 +50,11 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     late = [times.Run([1], [60.0], [value], 3.0) for value in (0.0, 0.0, 3000.0)]
     assert times.cell(late, 1000) == "– (1 of 3 seeds)"
     fast = [times.Run([1], [24.0], [3000.0], 3.0)]
-    assert [times.ratio(late, fast, 1000), times.ratio(fast, late, 1000)] == ["> 7.5", "–"]
-    pairs = {"ours": fast, "slow": [times.Run([1], [60.0], [1500.0], 3.0)]}
+    assert [times.ratio(late, fast, 1000), times.ratio(fast, late, 1000)] == ["> 2.5", "–"]
+    pairs = {"ours": fast, "slow": [times.Run([1, 2], [60.0, 180.0], [1500.0, 0.0], 3.0)]}
     assert times.ratios({5: pairs}, "ours").splitlines()[2:] == ["| 5 | slow | 2.5 | > 7.5 | > 7.5 |"]
+    mixed = [times.Run([1], [24.0], [3000.0], 3.0), times.Run([1, 2], [24.0, 96.0], [0.0, 0.0], 3.0)]
+    assert times.ratio(mixed, fast, 1000) == "> 2.5"  # 24 s, and more than 96
     assert (tmp_path / "times.png").stat().st_size > 5_000
 
 

@@ -118,7 +118,7 @@ def test_of_each_episode() -> None:
         ("episode:2:4", uniform(2, 4), "episode:2:4"),
         ("episode:uniform:2:4", uniform(2, 4), "episode:2:4"),
         ("episode:0.05s:120ms", uniform(2, 3), "episode:2:3"),
-        ("episode:choice:1=0.5,80ms=0.5", Choice((1, 2), (0.5, 0.5)), "episode:choice:1=0.5,2=0.5"),
+        ("episode:choice:40ms=0.5,80ms=0.5", Choice((1, 2), (0.5, 0.5)), "episode:choice:1=0.5,2=0.5"),
         ("episode:walk:3", random_walk(3), "episode:walk:3"),
         ("episode:recorded:3,1,", Recorded((3, 1)), "episode:recorded:3,1,"),
         ("episode:3", Constant(3), "episode:3"),
@@ -254,7 +254,7 @@ def test_channels_of_a_text() -> None:
         ("80ms", "no `dt`"),
         ("1+2", "is not a number"),
         ("1+observation=2", "two for the observations"),
-        ("2+reward=3@raw", "newest or fifo"),
+        ("2+reward=3@raw", "newest, fifo or wait"),
         ("recorded:nowhere.csv", "No such file"),
         ("recorded:a+b@c.csv", "a\\+b@c.csv"),
         ("recorded", "takes values after a colon"),
@@ -280,6 +280,21 @@ def test_bad_texts(text: str, words: str) -> None:
     with pytest.raises(DelayRLError, match=words) as error:
         as_delay(text)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("uniform:100ms:200", "'uniform:100ms:200' mixes steps and times: '200' has no unit, as in 200ms"),
+        ("200ms~15", "'200ms~15' mixes steps and times: '15'"),
+        ("3+action=episode:2:80ms", "'episode:2:80ms' mixes steps and times: '2'"),
+    ],
+)
+def test_a_law_is_in_steps_or_in_time(text: str, words: str) -> None:
+    """A forgotten unit would be 200 steps, not 200 ms. Each channel may have its own, and 0 needs none."""
+    with pytest.raises(DelayRLError, match=words):
+        as_delay(text, 0.02)
+    assert as_delay("uniform:0:0.2s@fifo+action=2", 0.02) == as_delay("uniform:0:200ms@fifo+action=40ms", 0.02)
 
 
 @pytest.mark.parametrize(

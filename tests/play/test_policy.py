@@ -55,6 +55,8 @@ def test_policy_refuses_what_it_does_not_know(vdpo: Run) -> None:
         policy.act(obs[:4], {"age": 1, "actions": actions})
     with pytest.raises(delayrl.DelayRLError, match="needs the 3 actions"):
         policy.act(obs, {"age": 3, "actions": actions[:2]})
+    with pytest.raises(delayrl.DelayRLError, match="not finite"):
+        policy.act(obs * np.nan, {"age": 1, "actions": actions})
     for info in ({}, {"age": 1}, {"actions": actions}):
         with pytest.raises(delayrl.DelayRLError, match=r"the info that `Delayed` gives: it has no age and actions"):
             policy.act(obs, info)

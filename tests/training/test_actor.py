@@ -39,6 +39,16 @@ def test_nan_from_the_environment(what: str, tmp_path: Path, monkeypatch) -> Non
     assert newest(train("bpql", tmp_path / "run")).step == 300
 
 
+def test_actions_beyond_their_range() -> None:
+    """A forgotten tanh would make returns that nobody can compare."""
+    actor = Actor(make("Reacher-v5", 3, rescale=True), 7, privileged=False)
+    actor.step(np.ones(2, np.float32))
+    with pytest.raises(delayrl.DelayRLError, match=r"policy of seed 7 gives actions beyond \[-1, 1\]"):
+        actor.step(np.array([0.5, -1.01], np.float32))
+    with pytest.raises(delayrl.DelayRLError, match="not finite: training diverged"):
+        actor.step(np.array([0.5, np.nan], np.float32))
+
+
 def test_official_protocol(tmp_path: Path) -> None:
     """One start state for all episodes, time limits as terminations, a random first action: stated in every row."""
     run = train("a-sac", tmp_path / "run", protocol="official", steps=150)

@@ -10,7 +10,7 @@ import delayrl
 from conftest import quick
 from delayrl.cli.main import main
 from delayrl.play.run import Run
-from delayrl.training.resume import part_of
+from delayrl.training.resume import fitting, part_of
 from short_runs import arrays, newest, train
 
 
@@ -170,6 +170,14 @@ def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: py
     assert np.abs(arrays(back)["critic.0.0.w"] - arrays(new)["reference.critic.0.0.w"]).max() < 5e-3
     with pytest.raises(delayrl.DelayRLError, match="sac has no network that fits: it lacks"):
         train("dcac", tmp_path / "dcac", start_from=old.path)
+
+
+def test_of_a_deeper_network_no_part_is_taken() -> None:
+    """Two blocks of three would be no network that anyone trained. Counters and optimisers begin anew."""
+    shallow = {"encoder.blocks.0.w": np.zeros(2), "steps": np.zeros((), int), "a_opt_state.0.mu": np.zeros(2)}
+    deep = shallow | {"encoder.blocks.1.w": np.zeros(2)}
+    assert fitting(shallow, shallow) == (["encoder.blocks"], [])
+    assert fitting(shallow, deep) == fitting(deep, shallow) == ([], ["encoder.blocks"])
 
 
 def test_parts_of_a_state() -> None:

@@ -15,7 +15,7 @@ from delayrl.envs import make
 from delayrl.training import loop
 from delayrl.training.actor import Actor
 from delayrl.training.loop import Loop
-from delayrl.training.state import TrainState
+from delayrl.training.state import TrainState, Ways
 
 SCHEDULE = Schedule(steps=10, random_steps=4, updates_per_call=2, evaluate_every=4)
 SEEDS = [3, 4]
@@ -58,7 +58,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, protocol: Proto
     actors = [Watched(make("delayrl/Counter-v0", 2, rescale=True), seed, False, protocol) for seed in SEEDS]
     setup = SimpleNamespace(schedule=schedule, delay=as_delay(2), protocol=protocol)
     group: Any = SimpleNamespace(
-        setup=setup, seeds=SEEDS, keys=None, spec=Spec(2, 1, 2), program=Fake(), apply=map, folders=[]
+        setup=setup, seeds=SEEDS, keys=None, spec=Spec(2, 1, 2), program=Fake(), ways=Ways(), apply=map, folders=[]
     )
     learner: Any = SimpleNamespace(agent=None, replay=SimpleNamespace(steps=np.array([99, 99])))
     state = TrainState(0, learner, actors, [], None, [{}, {}], [(0, 0), (0, 0)])

@@ -77,6 +77,23 @@ def test_a_task_without_a_limit_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("outcome", "line"),
+    [
+        ((np.zeros(2), 0.0, False, False), r"Arm gave an observation of shape \(2,\), but its .* has \(1,\)"),
+        ((np.zeros(1), np.zeros(2), False, False), r"Arm gave the reward array\(\[0., 0.\]\), terminated = False"),
+        ((np.zeros(1), None, False, False), "Arm gave the reward None, .* a number and two truth values"),
+        ((np.zeros(1), 0.0, np.zeros(2, bool), False), r"terminated = array\(\[False, False\]\)"),
+    ],
+)
+@pytest.mark.parametrize("when", ["training", "evaluation"])
+def test_what_no_environment_gives(when: str, outcome: tuple, line: str, tmp_path: Path, monkeypatch) -> None:
+    run = train("random", tmp_path / "run", env=make_arm) if when == "evaluation" else None
+    monkeypatch.setattr(Arm, "step", lambda self, action: (*outcome, {}))
+    with pytest.raises(DelayRLError, match=line):
+        evaluate(run.path, 2, env=make_arm) if run else train("random", tmp_path / "run", env=make_arm)
+
+
 def test_from_the_command_line(tmp_path: Path, monkeypatch, capsys) -> None:
     """In a process of its own, which has no path to the module but its working folder."""
     write_module(tmp_path, "my_cli_arm")

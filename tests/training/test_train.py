@@ -180,7 +180,7 @@ def test_damaged_configuration(tmp_path: Path) -> None:
 
 
 def test_agents_check_the_schedule(tmp_path: Path) -> None:
-    with pytest.raises(delayrl.DelayRLError, match="expert_steps must lie between"):
+    with pytest.raises(delayrl.DelayRLError, match="must lie between random_steps and steps"):
         train("dida", tmp_path / "dida", expert_steps=400)
     with pytest.raises(delayrl.DelayRLError, match="lifting_end must be no later"):
         train("lifting", tmp_path / "lifting", lifting_end=400)
@@ -286,6 +286,7 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ),
         ({"steps": 100, "update_every": 101, "clone_every": 102}, "the first update is at step 101"),
         ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after$"),
+        ({"log_std_range": [2.0, -20.0]}, "log_std_range is LOW HIGH, with LOW below HIGH; got 2.0, -20.0"),
         ({"track": "paper"}, "tensorboard or wandb"),
     ],
 )

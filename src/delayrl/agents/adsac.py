@@ -10,6 +10,7 @@ training is privileged (the behaviour reads s_t) unless `behaviour="augmented"`;
 Deviations from the paper and from the released code are numbered in docs/algorithms/ad-sac.md.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -51,7 +52,7 @@ class ADSAC:
     """The AD-SAC agent. Its hyperparameters default to the released code's."""
 
     learner: sac.SAC = field(default_factory=lambda: sac.SAC(actor_sees="augmented", critic_sees="augmented"))
-    auxiliary_delay: Annotated[int, "τ: delay for which values are learned, at most the task's delay"] = 0
+    auxiliary_delay: Annotated[int, "τ: delay for which values are learned, at most the task's", (0, math.inf)] = 0
     behaviour: Annotated[
         Behaviour,
         "who acts in training: augmented, or lower-q (for τ = 0, the actor with the lower Q; else augmented)",

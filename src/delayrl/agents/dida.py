@@ -7,7 +7,8 @@ action in the true state, whoever acted.
 Views: the expert sees s_t, the student x_t. Privileged: the expert acts on the true state in the first part of the run.
 (Labels need no privilege: a step is learned from only after its state has arrived.)
 
-The expert's steps count towards the run's environment steps: it learns and acts up to step `expert_steps`.
+The expert's steps count towards the run's environment steps: it learns and acts up to step `expert_steps`, rounded
+up to whole rounds.
 Deviations from the paper and from the released code are numbered in docs/algorithms/dida.md.
 """
 
@@ -42,9 +43,7 @@ class DIDA:
     """The DIDA agent. The student's defaults are the released code's, the expert's are those of VDPO's reference."""
 
     reference: sac.SAC = field(default_factory=sac.SAC)
-    expert_steps: Annotated[int, "steps in which the expert learns and acts; a multiple of round_steps", "scales"] = (
-        500_000
-    )
+    expert_steps: Annotated[int, "steps in which the expert learns and acts, up to a round's end", "scales"] = 500_000
     round_steps: Annotated[int, "environment steps in a round of aggregation, in which the student acts"] = 1000
     imitation_updates: Annotated[int, "student updates after each round, on fresh batches of all data"] = 1000
     student_hidden: Annotated[tuple[int, ...], "widths of the student's hidden layers"] = (100, 100)
@@ -79,10 +78,10 @@ class DIDA:
         """
         if schedule.observation_norm != "none":
             raise DelayRLError(f"dida takes observation_norm none; got {schedule.observation_norm}")
-        if not schedule.random_steps < self.expert_steps < schedule.steps:
+        if not schedule.random_steps < self.expert_end < schedule.steps:
             raise DelayRLError(
-                f"expert_steps must lie between random_steps and steps, {schedule.random_steps} and {schedule.steps}; "
-                f"got {self.expert_steps}"
+                f"expert_steps, rounded up to whole rounds of {self.round_steps}, must lie between random_steps and "
+                f"steps, {schedule.random_steps} and {schedule.steps}; got {self.expert_steps}"
             )
         return self
 
@@ -92,15 +91,16 @@ class DIDA:
             raise DelayRLError("dida learns a policy for a delay of at least 1 step: give --delay N, or train sac")
         if (self.reference.update_every, self.reference.updates) != (1, 1):
             raise DelayRLError("dida's expert is updated once a step: leave update_every and updates at 1")
-        if self.expert_steps % self.round_steps:
-            raise DelayRLError(
-                f"expert_steps must be a multiple of round_steps = {self.round_steps}; got {self.expert_steps}"
-            )
         reference_key, student_key = jax.random.split(key)
         sizes = (input_size(spec, "augmented"), *self.student_hidden, spec.action_size)
         student = networks.mlp_init(student_key, sizes)
         reference = self.reference.init(replace(spec, delay=0), reference_key)
         return State(reference, student, self.optimiser.init(student), jnp.zeros((), jnp.int32))
+
+    @property
+    def expert_end(self) -> int:
+        """The step at which the expert ends: with a round, so that the student learns before it acts."""
+        return -(-self.expert_steps // self.round_steps) * self.round_steps
 
     @property
     def optimiser(self) -> optax.GradientTransformation:
@@ -120,14 +120,14 @@ class DIDA:
             return student
         assert seen.truth is not None, "behaviour with the expert is privileged"
         expert = self.reference.act(state.reference, seen._replace(obs=seen.truth), key, explore=True)
-        return jnp.where(state.steps < self.expert_steps, expert, student)
+        return jnp.where(state.steps < self.expert_end, expert, student)
 
     def deterministic(self, state: State) -> Deterministic:
         """Return the student."""
         return Deterministic("augmented", state.student)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """Update the expert by SAC, up to `expert_steps`; `count` is the environment step, the same for all seeds."""
+        """Update the expert by SAC, up to `expert_end`; `count` is the environment step, the same for all seeds."""
 
         def learn(reference: sac.State) -> tuple[sac.State, Metrics]:
             return self.reference.update(reference, windows, key, count)
@@ -135,7 +135,7 @@ class DIDA:
         _, metrics = jax.eval_shape(learn, state.reference)
         idle = {name: jnp.zeros(metric.shape, metric.dtype) for name, metric in metrics.items()}
         reference, metrics = jax.lax.cond(
-            count <= self.expert_steps, learn, lambda reference: (reference, idle), state.reference
+            count <= self.expert_end, learn, lambda reference: (reference, idle), state.reference
         )
         return state._replace(reference=reference, steps=jnp.asarray(count, jnp.int32)), metrics
 
@@ -149,7 +149,7 @@ class DIDA:
             return student, opt_state, loss
 
         student, opt_state, loss = jax.lax.cond(
-            self.phases()[1].step_of(count) >= self.expert_steps,
+            self.phases()[1].step_of(count) >= self.expert_end,
             learn,
             lambda student, opt_state: (student, opt_state, jnp.zeros(())),
             state.student,

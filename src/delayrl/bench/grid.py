@@ -15,9 +15,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-
-from delayrl.core.replay import init
 from delayrl.envs import make
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
@@ -27,7 +24,7 @@ from delayrl.run.agents import find_agent
 from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
 from delayrl.run.configuration import check_names, options
-from delayrl.training.checks import check_fit
+from delayrl.training.checks import check_fit, replay_bytes
 
 LISTS = {"agents": list, "tasks": list, "delays": list}
 TASK = {"env_kwargs": dict, "wrappers": list, "flatten": bool}
@@ -220,10 +217,9 @@ def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str,
     setup = resolve(agent, env, delay, preset, protocol, json.loads(overrides))
     task = make(env, setup.delay.observed())
     check_fit(setup, task)
-    spec = spec_of(task)
+    size = replay_bytes(setup, spec_of(task))
     task.close()
-    replay = jax.eval_shape(lambda: init(spec, setup.schedule.replay_capacity // setup.entries(spec)))
-    return setup, sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(replay))
+    return setup, size
 
 
 def _check_overlap(cells: list[Planned]) -> None:

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from delayrl.bench.folders import LockedError, hold, journal, note, seed_folders, stored
 from delayrl.errors import DelayRLError, StoppedError, described
+from delayrl.run.rows import CONDITION
 
 Kind = Literal["done", "stopped", "failed", "died", "locked"]
 
@@ -70,7 +71,7 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
 
     try:
         note(folder, "begun", pid=os.getpid(), step=step, versions=versions())
-        condition = {name: cell[name] for name in ("agent", "env", "delay", "preset", "protocol")} | cell["overrides"]
+        condition = {name: cell[name] for name in CONDITION} | cell["overrides"]
         out = folder if len(seeds) > 1 else seed_folders(folder, seeds)[0]
         train(**condition, seed=seeds[0], seeds=len(seeds), out=out, device=device, progress=False, slim=True)
         note(folder, "done")

@@ -1,6 +1,6 @@
 """Views: what a network sees, taken from a window of the undelayed trajectory or, when acting, from the wrapper."""
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from delayrl.core.types import Seen, Spec, Window
+from delayrl.errors import DelayRLError
 
 Sees = Literal["current", "delayed", "augmented"]
 """The true state s_t; only the last observation that arrived, s_{t-d}; or x_t, which adds the actions since."""
@@ -30,7 +31,12 @@ def view(
 
     Returns:
         obs [S], age [], actions [delay, A] (oldest first, zeros after the first `age`).
+
+    Raises:
+        DelayRLError: a window that does not reach so far ahead.
     """
+    if isinstance(ahead, int) and ahead >= (reach := window.obs.shape[0] - window.delay):
+        raise DelayRLError(f"windows reach {reach - 1} steps after t, as the agent's `ahead` says; got ahead={ahead}")
     delay = window.delay if delay is None else delay
     now = window.delay + jnp.asarray(ahead, jnp.int32)
     age = jnp.minimum(window.age[now] if age is None else age, delay)
@@ -44,6 +50,8 @@ def network_input(seen: Seen, sees: Sees) -> Float[Array, " input"]:
 
     The age distinguishes an empty slot at the start of an episode from a zero action. Without a delay, x_t is s_t.
     """
+    if sees not in get_args(Sees):
+        raise DelayRLError(f"a network sees {', '.join(get_args(Sees))}; got {sees!r}")
     delay = seen.actions.shape[-2]
     if sees != "augmented" or delay == 0:
         return seen.obs

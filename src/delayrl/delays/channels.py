@@ -38,7 +38,7 @@ from delayrl.errors import DelayRLError
 Rule = Literal["newest", "fifo", "raw", "wait"]
 """Which message counts at step t. `newest`: of those that have arrived, the last one sent; older ones that arrive later
 are ignored. `fifo`: the same, but no message overtakes another. `raw`: s_{t-d} with d drawn anew at each step, so that
-the observation may go back in time."""
+the observation may go back in time. `wait`: each message counts once the longest delay has passed since it was sent."""
 StepSeconds = float | Callable[[], float | None] | None
 """The length of an environment step, or a function that returns it; None if it is unknown."""
 NO_DELAY = Constant(0)
@@ -90,7 +90,7 @@ CHANNELS = ("observation", "action", "reward")
 FORMS = (
     "a delay is 5, 80ms, uniform:1:5, choice:1=0.1,5=0.9, poisson:MEAN:MAX, gamma:MEAN:DEVIATION:MAX, "
     "gilbert:GOOD:BAD:WORSEN:RECOVER, walk:MAX, markov:0,5:0.9,0.1/0.5,0.5, recorded:FILE, episode:2:4, 80ms~, "
-    "paper-stochastic-5, or MODULE:CLASS(ARGUMENT=VALUE); then @newest, @fifo or @raw"
+    "paper-stochastic-5, or MODULE:CLASS(ARGUMENT=VALUE); then @newest, @fifo, @raw or @wait"
 )
 
 
@@ -113,7 +113,9 @@ class Delay:
                 channel = Channel()  # all ways to write no delay are equal
             object.__setattr__(self, name, channel)
         if self.reward.rule == "raw" and self.reward.maximum:
-            raise DelayRLError("rewards arrive as newest or fifo: with raw some would be lost and others come twice")
+            raise DelayRLError(
+                "rewards arrive as newest, fifo or wait: with raw some would be lost and others come twice"
+            )
 
     @property
     def maximum(self) -> int:
@@ -228,6 +230,7 @@ class DelayParser:
 
     def __init__(self, text: str, step_seconds: StepSeconds = None, folder: Path | None = None):
         self._text, self._given_seconds, self._folder = text, step_seconds, folder
+        self._read: dict[str, list[str]] = {}  # the travel times of one law, by their units
 
     @cached_property
     def step_seconds(self) -> float | None:
@@ -252,9 +255,17 @@ class DelayParser:
         head, separator, rule = part.rpartition("@")
         in_path = re.match("(episode:)*recorded:", part) and rule not in get_args(Rule)
         if not separator or in_path or ")" in rule:
-            return PRESETS.get(part) or Channel(self.law(part))
-        law = PRESETS[head].law if head in PRESETS else self.law(head)
+            return PRESETS.get(part) or Channel(self._in_one_unit(part))
+        law = PRESETS[head].law if head in PRESETS else self._in_one_unit(head)
         return Channel(law, rule)  # type: ignore[arg-type]  # Channel checks the rule
+
+    def _in_one_unit(self, part: str) -> DelayLaw:
+        """Return the law that a part of the text describes, if all its travel times are steps or all are times."""
+        self._read = dict[str, list[str]]()
+        law = self.law(part)
+        if bare := self._read.pop("", []) if len(self._read) > 1 else []:
+            raise DelayRLError(f"{part!r} mixes steps and times: {bare[0]!r} has no unit, as in {bare[0]}ms")
+        return law
 
     def law(self, part: str) -> DelayLaw:
         """Return the law that a part of the text describes."""
@@ -309,12 +320,12 @@ class DelayParser:
 
     def real(self, word: str) -> float:
         """Read a number of steps or a time, without rounding."""
-        number, unit = self._split(word)
+        number, unit = self._travel_time(word)
         return in_steps(number, unit, self.step_seconds) if unit else number
 
     def steps(self, word: str) -> int:
         """Read whole steps, or a time that is rounded up to whole steps."""
-        number, unit = self._split(word)
+        number, unit = self._travel_time(word)
         if unit:
             return rounded_up(in_steps(number, unit, self.step_seconds))
         return whole_steps(int(number) if number.is_integer() else number)
@@ -325,6 +336,13 @@ class DelayParser:
         if unit:
             raise DelayRLError(f"a probability has no unit; got {word!r} in the delay {self._text!r}")
         return number
+
+    def _travel_time(self, word: str) -> tuple[float, str]:
+        """Split a travel time into its number and its unit, and remember it: 0 needs no unit."""
+        number, unit = self._split(word)
+        if number:
+            self._read.setdefault(unit, []).append(word)
+        return number, unit
 
     def _split(self, word: str) -> tuple[float, str]:
         """Split a word into its number and its unit."""

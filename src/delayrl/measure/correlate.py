@@ -12,6 +12,7 @@ The null distribution comes from the same signals, shifted by more than the long
 has the accuracy of this and of simpler methods, on plants with a known delay.
 """
 
+import math
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -132,6 +133,8 @@ def peak(r: Array) -> tuple[float, float]:
 def _tail(null: Array, chance: float) -> float:
     """Return what a sum of squares exceeds with this probability, for a scaled χ² with the null's mean and variance."""
     mean, variance = float(null.mean()), max(float(null.var()), 1e-12)
+    if mean <= 0:  # these rows have no far lags, so nothing is known of chance
+        return math.inf
     freedom = 2 * mean**2 / variance
     z, c = NormalDist().inv_cdf(1 - chance), 2 / (9 * freedom)
     return mean * (1 - c + z * c**0.5) ** 3  # the cube-root approximation of Wilson and Hilferty

@@ -83,6 +83,8 @@ class Evaluator:
         while running.any():
             batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
             actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
+            if not (np.abs(actions[running]) <= 1).all():
+                raise DelayRLError("the policy gives actions beyond [-1, 1], or none that are numbers, in evaluation")
             actions = opening[:, :, step] if opening is not None and step < opening.shape[2] else actions
             step += 1
             alive = [(int(i), int(j)) for i, j in np.argwhere(running)]
@@ -90,7 +92,7 @@ class Evaluator:
             for (i, j), (obs, reward, terminated, truncated, info) in zip(alive, played, strict=True):
                 if not (np.isfinite(reward) and np.isfinite(info["truth"]).all()):
                     raise DelayRLError("the environment gave a number that is not finite in evaluation")
-                returns[i, j] += float(reward)
+                returns[i, j] += reward
                 lengths[i, j] += 1
                 running[i, j] = not (terminated or truncated)
                 seen[i][j] = self._see(obs, info)

@@ -47,7 +47,8 @@ class Policy:
                 `Delayed` puts there.
 
         Raises:
-            DelayRLError: wrong sizes, no age or actions, or an age that the policy was not trained for.
+            DelayRLError: wrong sizes, numbers that are not finite, no age or actions, or an age that the policy was not
+                trained for.
         """
         if not {"age", "actions"} <= info.keys():
             raise DelayRLError("the policy needs the info that `Delayed` gives: it has no age and actions here")
@@ -58,6 +59,8 @@ class Policy:
             raise DelayRLError(f"the policy was trained for ages 0..{self.spec.delay}; got {age}")
         if len(actions) < age:
             raise DelayRLError(f"an observation of age {age} needs the {age} actions taken since; got {len(actions)}")
+        if not (np.isfinite(obs).all() and np.isfinite(actions).all()):
+            raise DelayRLError("the policy was given an observation or an action that is not finite")
         scaled = 2 * (actions - self.low) / (self.high - self.low) - 1
         seen = seen_now(obs, {"age": age, "actions": scaled}, self.spec.delay, privileged=False)
         self._key, key = jax.random.split(self._key)

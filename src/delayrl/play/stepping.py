@@ -4,28 +4,44 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from delayrl.envs.making import name_of
 from delayrl.errors import DelayRLError, described
 
 
 def reset(env: Any, seed: int) -> tuple[Any, dict[str, Any]]:
-    """Start an episode. Raises DelayRLError for whatever the environment raises, with its traceback attached."""
+    """Start an episode. Raises DelayRLError for whatever the environment raises, and for what no environment gives."""
     try:
-        return env.reset(seed=seed)  # type: ignore[no-any-return]
+        obs, info = env.reset(seed=seed)
     except DelayRLError:
         raise
     except Exception as error:  # a try for each step costs nothing, a context manager would
         raise _one_line(env, "reset", error) from error
+    _check_shape(env, info["truth"])
+    return obs, info
 
 
-def step(env: Any, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-    """Take a step. Raises DelayRLError for whatever the environment raises, with its traceback attached."""
+def step(env: Any, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """Take a step. Raises DelayRLError for whatever the environment raises, and for what no environment gives."""
     try:
-        return env.step(action)  # type: ignore[no-any-return]
+        obs, reward, terminated, truncated, info = env.step(action)
     except DelayRLError:
         raise
     except Exception as error:
         raise _one_line(env, "step", error) from error
+    _check_shape(env, info["truth"])
+    try:
+        return obs, float(reward), bool(terminated), bool(truncated), info
+    except (TypeError, ValueError):
+        given = f"the reward {reward!r}, terminated = {terminated!r} and truncated = {truncated!r}"
+        raise DelayRLError(f"{name_of(env)} gave {given}: they must be a number and two truth values") from None
+
+
+def _check_shape(env: Any, truth: Any) -> None:
+    if np.shape(truth) != env.observation_space.shape:
+        declared = f"its observation_space has {env.observation_space.shape}"
+        raise DelayRLError(f"{name_of(env)} gave an observation of shape {np.shape(truth)}, but {declared}")
 
 
 def _one_line(env: Any, method: str, error: Exception) -> DelayRLError:

@@ -49,11 +49,16 @@ class Option:
             count = len(inner) if inner[-1] is not Ellipsis else None
             if not isinstance(value, tuple | list) or not value or (count and len(value) != count):
                 raise DelayRLError(f"{self.name} takes {count or 'one or more'} numbers; got {value!r}")
-            return tuple(Option(self.name, inner[0], None, "").check(item) for item in value)
+            numbers = tuple(Option(self.name, inner[0], None, "").check(item) for item in value)
+            if self.name.endswith("_range") and numbers[0] >= numbers[-1]:
+                raise DelayRLError(f"{self.name} is LOW HIGH, with LOW below HIGH; got {', '.join(map(str, value))}")
+            return numbers
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise DelayRLError(f"{self.name} must be a number; got {value!r}")
         if not self.bounds[0] <= value <= self.bounds[1]:
-            raise DelayRLError(f"{self.name} must lie in {self.bounds[0]:g} .. {self.bounds[1]:g}; got {value!r}")
+            low, high = self.bounds
+            allowed = f"lie in {low:g} .. {high:g}" if math.isfinite(high) else f"be at least {low:g}"
+            raise DelayRLError(f"{self.name} must {allowed}; got {value!r}")
         if self.kind is float:
             return float(value)
         least = 0 if 0 in (self.default, self.bounds[0]) else 1  # a preset may have another default
@@ -88,9 +93,9 @@ def override(config: Any, values: Mapping[str, Any]) -> Any:
     return replace(config, **changes)
 
 
-def check_names(values: Iterable[str], *configs: Any, also: Iterable[str] = ()) -> None:
-    """Raise DelayRLError, with the nearest names, for a name that is no option of the dataclasses nor among `also`."""
-    known = [option.name for config in configs for option in options(config)] + list(also)
+def check_names(values: Iterable[str], *configs: Any) -> None:
+    """Raise DelayRLError, with the nearest names, for a name that is no option of the dataclasses."""
+    known = [option.name for config in configs for option in options(config)]
     for name in values:
         if name not in known:
             near = near_names(name, [*known, "start_from"])  # an option of `train` alone

@@ -9,10 +9,9 @@ from delayrl.errors import DelayRLError
 Row = dict[str, Any]
 CONDITION: dict[str, Any] = {"agent": str, "env": str, "delay": int | str, "preset": str, "protocol": str}
 """The columns that describe a row's condition, with their types."""
-NUMBERS = {"episode": int, "reset_seed": int, "return": float, "length": int}
 CONFIGURATION = "configuration"
 """The column with the hash of a run's options. Rows of version 0.1 have none."""
-EPISODE: dict[str, type] = {"step": int, "policy": str, **NUMBERS}
+EPISODE = {"step": int, "policy": str, "episode": int, "reset_seed": int, "return": float, "length": int}
 """The columns that differ between the rows of a run, with their types."""
 
 

@@ -40,26 +40,20 @@ class Actor:
 
     def step(self, action: NDArray[np.float32]) -> Transition:
         """Act, and start the next episode if this one ends. Returns the true step."""
-        if not np.isfinite(action).all():
-            raise DelayRLError(f"the policy of seed {self.seed} gives actions that are not finite: training diverged")
+        if not (np.abs(action) <= 1).all():
+            wrong = "beyond [-1, 1]" if np.isfinite(action).all() else "that are not finite: training diverged"
+            raise DelayRLError(f"the policy of seed {self.seed} gives actions {wrong}")
         truth, age = self.truth, self.seen.age
         obs, reward, terminated, truncated, info = stepping.step(self.env, action)
         self.actions.append(action)
         self._see(obs, info)
-        reward, done = float(reward), terminated or truncated
+        done = terminated or truncated
         if not np.isfinite(reward):
             self._refuse("a reward")
         self.total += reward
-        transition = Transition(
-            truth,  # type: ignore[arg-type]
-            age,
-            action,  # type: ignore[arg-type]
-            np.float32(reward),  # type: ignore[arg-type]
-            np.bool_(done if self.protocol.time_limit == "terminates" else terminated),  # type: ignore[arg-type]
-            np.bool_(done),  # type: ignore[arg-type]
-            self.truth,  # type: ignore[arg-type]
-            self.seen.age,
-        )
+        ends = np.bool_(done if self.protocol.time_limit == "terminates" else terminated)
+        outcome: tuple[Any, ...] = (np.float32(reward), ends, np.bool_(done), self.truth, self.seen.age)
+        transition = Transition(truth, age, action, *outcome)  # type: ignore[arg-type]
         if done:
             self.finished.append({"episode": self.episode, "return": self.total, "length": len(self.actions)})
             self.start_episode(self.episode + 1)
@@ -71,7 +65,7 @@ class Actor:
         for action in actions:
             obs, reward, _, _, info = stepping.step(self.env, action)
             self.actions.append(action)
-            self.total += float(reward)
+            self.total += reward
             self._see(obs, info)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> None:

@@ -1,27 +1,38 @@
 """What is refused before anything is stored or deleted."""
 
 from importlib.util import find_spec
-from typing import Any
+
+import jax
 
 from delayrl.agents.base import State, template
+from delayrl.core import replay as ring
+from delayrl.core.types import Spec
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import Setup
+from delayrl.training.state import Ways
 from delayrl.training.tracking import SERVICES
 from delayrl.wrappers import Delayed
 from delayrl.wrappers.single import check_limit
 
 
-def check_ways(threads: int, track: str | None, callback: Any) -> None:
+def check_ways(ways: Ways) -> None:
     """Raise DelayRLError for ways to train that are none."""
-    if threads < 1:
-        raise DelayRLError(f"threads must be at least 1; got {threads}")
+    track = ways.track
+    if ways.threads < 1:
+        raise DelayRLError(f"threads must be at least 1; got {ways.threads}")
     if track is not None and track not in SERVICES:
         raise DelayRLError(f"track must be {' or '.join(SERVICES)}; got {track!r}")
     if track is not None and find_spec(SERVICES[track]) is None:
         raise DelayRLError(f"--track {track} needs `pip install 'delayrl[{track}]'`")
-    if callback is not None and not callable(callback):
-        raise DelayRLError(f"callback is a function of the step and the runs; got {callback!r}")
+    if ways.callback is not None and not callable(ways.callback):
+        raise DelayRLError(f"callback is a function of the step and the runs; got {ways.callback!r}")
+
+
+def replay_bytes(setup: Setup, spec: Spec) -> int:
+    """Return the size of one seed's replay."""
+    replay = jax.eval_shape(lambda: ring.init(spec, setup.schedule.replay_capacity // setup.entries(spec)))
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(replay))
 
 
 def check_fit(setup: Setup, env: Delayed) -> State:

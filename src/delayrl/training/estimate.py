@@ -1,15 +1,13 @@
 """How long a run will take, before it starts."""
 
+import math
 import time
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from delayrl.agents.base import Agent, Phase, template
-from delayrl.core import replay as ring
 from delayrl.core.precision import product
-from delayrl.core.types import Spec
+from delayrl.training.cost import cost_of
 from delayrl.training.state import Group, TrainState
 
 UTILISATION = 0.25
@@ -19,6 +17,8 @@ UTILISATION = 0.25
 def estimate(group: Group, state: TrainState) -> str:
     """Return in words how long the rest of a run will take on this device."""
     hours, steps = _seconds(group, state) / 3600, group.setup.schedule.steps - state.step
+    if math.isnan(hours):
+        return f"none for {steps:,} steps, because how often a loop of the updates runs depends on data"
     if hours < 0.5:
         return f"about {max(1, round(hours * 60))} min for {steps:,} steps on this device"
     advice = "; --preset small takes minutes" if group.setup.condition.preset == "paper" else ""
@@ -36,18 +36,7 @@ def _seconds(group: Group, state: TrainState) -> float:
     rate = 4 * 2 * 1024**3 / (time.perf_counter() - start)
     schedule = group.setup.schedule
     seconds = (schedule.steps - state.step) * 2e-4
-    for phase in group.program.phases:
-        cost = jax.jit(phase.update).lower(*update_shapes(phase, group.setup.agent, group.spec)).cost_analysis()
-        flops = float((cost or {}).get("flops", 0.0))
-        rounds = (schedule.steps - max(state.step, schedule.first_update)) / phase.every
-        seconds += max(rounds, 0) * phase.updates * len(group.seeds) * (flops / (UTILISATION * rate) + 3e-4)
-    return seconds
-
-
-def update_shapes(phase: Phase, agent: Agent, spec: Spec) -> tuple[Any, ...]:
-    """Return the shapes and types of the arguments of a phase's update for one seed. Touches no device."""
-    reach = (phase.batch, spec.delay, agent.ahead(spec))
-    replay = jax.eval_shape(lambda: ring.init(spec, 2))
-    key, number = jax.eval_shape(lambda: jax.random.key(0)), jax.ShapeDtypeStruct((), jnp.int32)
-    windows = jax.eval_shape(lambda replay, key, hidden: ring.sample(replay, key, *reach, hidden), replay, key, number)
-    return template(agent, spec), windows, key, number
+    updates = sum(phase.updates / phase.every for phase in group.program.phases)
+    flops = cost_of(group.setup.agent, group.spec, schedule).flops
+    learning = max(schedule.steps - max(state.step, schedule.first_update), 0)
+    return seconds + learning * len(group.seeds) * (flops / (UTILISATION * rate) + updates * 3e-4)

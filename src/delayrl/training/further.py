@@ -14,7 +14,7 @@ from delayrl.run.agents import AgentLike, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
 from delayrl.run.configuration import OLDER, values_of
 from delayrl.run.folder import RunFolder, RunLike, path_of, seed_folders
-from delayrl.training.loop import Callback
+from delayrl.training.state import Callback, Ways
 from delayrl.training.train import train_group
 
 
@@ -66,18 +66,7 @@ def go_on(
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     numbers = [config["seed"] for config in configs]
-    train_group(
-        setup,
-        numbers,
-        runs,
-        device=device,
-        threads=threads,
-        track=track,
-        slim=slim,
-        callback=callback,
-        progress=progress,
-        further=True,
-    )
+    train_group(setup, numbers, runs, Ways(device, track, threads, slim, callback, progress), further=True)
     ended = [Run(one.path) for one in runs]
     return ended[0] if runs[0].path == path_of(run) else ended
 

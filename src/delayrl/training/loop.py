@@ -30,19 +30,9 @@ from delayrl.training.signals import stop_signal
 from delayrl.training.state import Group, TrainState
 
 METRICS_EVERY = 1000
-Callback = Callable[[int, list[Run]], Any]
-"""A function of the step and the runs, called after each evaluation is stored. If it returns true, training ends."""
 
 
-def run(
-    group: Group,
-    state: TrainState,
-    note: Callable[[str], None],
-    *,
-    progress: bool = False,
-    track: str | None = None,
-    callback: Callback | None = None,
-) -> None:
+def run(group: Group, state: TrainState, note: Callable[[str], None]) -> None:
     """Train from a state to the last step, or until the callback ends it, and draw the learning curves.
 
     Raises:
@@ -51,14 +41,19 @@ def run(
     """
     steps = group.setup.schedule.steps
     if state.step < steps:
-        loop = Loop(group, state, Recorder(group, state.learner.agent, state.actors[0].env, track))
-        if progress:
+        loop = Loop(group, state, Recorder(group, state.learner.agent, state.actors[0].env, group.ways.track))
+        if group.ways.progress:
             note(f"estimate: {estimate(group, state)}")
         interval = 0.5 if sys.stderr.isatty() else 30
-        options = {"disable": not progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
+        options = {
+            "disable": not group.ways.progress,
+            "smoothing": 0.05,
+            "dynamic_ncols": True,
+            "mininterval": interval,
+        }
         bar = tqdm(total=steps, initial=state.step, unit="step", **options)
         with stop_signal() as stop, bar:
-            loop.train(stop.is_set, bar, callback)
+            loop.train(stop.is_set, bar)
     for folder in group.folders:
         curve(folder.read("rows"), folder.path / "curve.png")
 
@@ -73,9 +68,9 @@ class Loop:
         self._learning = False
         self._began, self._began_step = time.perf_counter(), state.step
 
-    def train(self, stopped: Callable[[], bool], bar: Any, callback: Callback | None = None) -> None:
+    def train(self, stopped: Callable[[], bool], bar: Any) -> None:
         """Train until the last step, until `stopped()`, or until an evaluation after which the callback is true."""
-        schedule, state = self.group.setup.schedule, self.state
+        schedule, callback, state = self.group.setup.schedule, self.group.ways.callback, self.state
         while state.step < schedule.steps:
             if stopped():
                 self._recorder.episodes(self._ended)

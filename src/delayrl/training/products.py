@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 from numpy.typing import NDArray
 
-from delayrl.agents.base import Agent, Phase
+from delayrl.agents.base import Agent, Phase, template
+from delayrl.core import replay as ring
 from delayrl.core.types import Spec
-from delayrl.training.estimate import update_shapes
 
 Value = NDArray[Any] | None
 """A scalar of a program in each of C updates, [C] or one for all; None if it depends on data."""
@@ -56,12 +57,21 @@ SCALAR: dict[str, Callable[..., Any]] = {
 """The operations that decide which branch an update takes."""
 
 
-@functools.lru_cache(4)  # a run needs the traces twice
+@functools.lru_cache(4)  # a run needs the traces several times
 def traced_updates(agent: Agent, spec: Spec) -> list[tuple[Phase, Any]]:
     """Return each phase with the program of its update for one seed. Touches no device."""
     shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
     with jax.default_matmul_precision("float32"):  # in bfloat16 gradients that XLA deletes are written out
         return [(phase, jax.jit(phase.update).trace(*args).jaxpr.jaxpr) for phase, args in shapes]
+
+
+def update_shapes(phase: Phase, agent: Agent, spec: Spec) -> tuple[Any, ...]:
+    """Return the shapes and types of the arguments of a phase's update for one seed. Touches no device."""
+    reach = (phase.batch, spec.delay, agent.ahead(spec))
+    replay = jax.eval_shape(lambda: ring.init(spec, 2))
+    key, number = jax.eval_shape(lambda: jax.random.key(0)), jax.ShapeDtypeStruct((), jnp.int32)
+    windows = jax.eval_shape(lambda replay, key, hidden: ring.sample(replay, key, *reach, hidden), replay, key, number)
+    return template(agent, spec), windows, key, number
 
 
 def matmul_flops(function: Callable[..., Any], *args: Any) -> float:

@@ -107,7 +107,7 @@ def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -
         where = source.path.parents[1]
         raise DelayRLError(f"{where} has no network that fits: it lacks {', '.join(left)}, or has them in other sizes")
     note(f"taken over: {', '.join(taken)}; new: {', '.join(left) or 'no network'}, and the optimisers")
-    names = [name for name in fresh if "opt_state" not in name and part_of(name) in taken]
+    names = [name for name, leaf in fresh.items() if is_learned(name, leaf) and part_of(name) in taken]
 
     def filled(leaf: Any, name: str) -> Any:
         return jnp.broadcast_to(arrays[name], leaf.shape) if name in names else leaf
@@ -119,14 +119,21 @@ def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -
 def fitting(fresh: Arrays, stored: Arrays) -> tuple[list[str], list[str]]:
     """Return the parts of an agent's state that stored arrays can fill, and those that they cannot.
 
-    A part is a network or another piece that is of use only whole. Optimisers are never taken over.
+    A part is a network or another piece that is of use only whole. Optimisers and counters are never taken over.
     """
     parts: dict[str, bool] = {}
     for name, leaf in fresh.items():
-        if "opt_state" not in name:
+        if is_learned(name, leaf):
             fits = name in stored and stored[name].shape == leaf.shape
             parts[part_of(name)] = parts.get(part_of(name), True) and fits
-    return [name for name, fits in parts.items() if fits], [name for name, fits in parts.items() if not fits]
+    deeper = {part_of(name) for name in stored.keys() - fresh.keys() if any(word.isdigit() for word in name.split("."))}
+    taken = [name for name, fits in parts.items() if fits and name not in deeper]
+    return taken, [name for name in parts if name not in taken]
+
+
+def is_learned(name: str, leaf: Any) -> bool:
+    """Return whether a leaf of an agent's state is learned: it is no optimiser's, and no counter."""
+    return "opt_state" not in name and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def part_of(leaf: str) -> str:
@@ -237,7 +244,7 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
     pieces, stored = [], []
     for i, run in enumerate(group.folders):
         weights = flatten_tree(jax.tree.map(lambda x, i=i: x[i], agent))
-        if complete and group.slim:
+        if complete and group.ways.slim:
             run.save(state.step, weights, None, {}, complete=True)
             continue
         own, until = _save_replay(run, state, i, group.replay_rows)
@@ -246,7 +253,7 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
         pieces.append(own)
         stored.append(until)
     for run in group.folders if complete else []:  # once all seeds have their last checkpoint
-        run.finish(slim=group.slim)
+        run.finish(slim=group.ways.slim)
     return state if complete else replace(state, pieces=pieces, stored=stored)
 
 

@@ -30,7 +30,10 @@ def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
 
 
 def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) -> list[RunFolder]:
-    """Return the run folder of each seed: below `out`, or where it is None below runs/."""
+    """Return the run folder of each seed: below `out`, or where it is None below runs/.
+
+    Raises DelayRLError if several were to lie within a run.
+    """
     kind = f"{condition.agent.strip('<>')}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"
@@ -38,4 +41,6 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
         return [RunFolder(home)]
+    if RunFolder(home).exists:
+        raise DelayRLError(f"{home} is a run: several seeds need a folder of their own; give another --out")
     return [RunFolder(home / f"seed{seed}") for seed in seeds]

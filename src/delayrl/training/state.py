@@ -9,11 +9,27 @@ from numpy.typing import NDArray
 
 from delayrl.agents.base import State
 from delayrl.core.types import Key, Spec
+from delayrl.play.run import Run
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.condition import Setup
 from delayrl.run.folder import RunFolder
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Learner, Program, Stored
+
+Callback = Callable[[int, list[Run]], Any]
+"""A function of the step and the runs, called after each evaluation is stored. If it returns true, training ends."""
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How to train, which does not change what is learned: arguments of `train`."""
+
+    device: str | None = None
+    track: str | None = None
+    threads: int = 1
+    slim: bool = False
+    callback: Callback | None = None
+    progress: bool = True
 
 
 @dataclass(frozen=True)
@@ -27,8 +43,8 @@ class Group:
     spec: Spec
     template: State  # shapes and types of the agent's state
     program: Program
+    ways: Ways
     apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other
-    slim: bool = False  # whether a finished run keeps only its last networks
     source: Checkpoint | None = None  # of another run, whose networks training begins with
     further: bool = False  # whether these are runs of fewer steps, which go on
 

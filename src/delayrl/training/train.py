@@ -27,11 +27,11 @@ from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
 from delayrl.training.checks import check_fit, check_ways
 from delayrl.training.learner import compiled
-from delayrl.training.loop import Callback, run
+from delayrl.training.loop import run
 from delayrl.training.machine import shared
 from delayrl.training.resume import source_of, start
 from delayrl.training.seeds import run_folders, seed_numbers
-from delayrl.training.state import Group
+from delayrl.training.state import Callback, Group, Ways
 
 
 @overload
@@ -103,20 +103,8 @@ def train(
     if start_from is not None:
         origin, source = source_of(RunFolder(path_of(start_from)), [] if overwrite else folders)
         setup = replace(setup, origin={"from": origin})
-    train_group(
-        setup,
-        numbers,
-        folders,
-        given=delay,
-        device=device,
-        threads=threads,
-        track=track,
-        overwrite=overwrite,
-        progress=progress,
-        slim=slim,
-        source=source,
-        callback=callback,
-    )
+    ways = Ways(device, track, threads, slim, callback, progress)
+    train_group(setup, numbers, folders, ways, given=delay, overwrite=overwrite, source=source)
     runs = [Run(folder.path) for folder in folders]
     return runs[0] if seeds == 1 else runs
 
@@ -125,46 +113,41 @@ def train_group(
     setup: Setup,
     numbers: list[int],
     folders: list[RunFolder],
+    ways: Ways,
     *,
     given: DelayLike | None = None,
-    device: str | None = None,
-    threads: int = 1,
-    track: str | None = None,
     overwrite: bool = False,
-    progress: bool = True,
-    slim: bool = False,
     source: Checkpoint | None = None,
-    callback: Callback | None = None,
     further: bool = False,
 ) -> None:
-    """Train seeds in lockstep, each in its folder, from where these stand. The arguments are those of `train`."""
-    check_ways(threads, track, callback)
+    """Train seeds in lockstep, each in its folder, from where it stands; `given` is the delay as the user wrote it."""
+    check_ways(ways)
     envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
     keep_compiled()
-    if device != "gpu":
+    if ways.device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     with ExitStack() as held:
         for folder in folders:
             held.enter_context(hold(folder.path))
-        pool = held.enter_context(ThreadPoolExecutor(threads))
-        held.enter_context(on_device(device))
+        pool = held.enter_context(ThreadPoolExecutor(ways.threads))
+        held.enter_context(on_device(ways.device))
         held.enter_context(jax.default_matmul_precision(setting(setup.schedule.precision)))
         privileged, rules = setup.agent.privileged, setup.protocol
         actors = [Actor(task, number, privileged, rules) for task, number in zip(envs, numbers, strict=True)]
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
-        apply = pool.map if threads > 1 else map
-        group = Group(setup, numbers, folders, keys, spec, shapes, program, apply, slim, source, further)
+        apply = pool.map if ways.threads > 1 else map
+        group = Group(setup, numbers, folders, keys, spec, shapes, program, ways, apply, source, further)
 
         def note(line: str) -> None:
-            if progress:
+            if ways.progress:
                 tqdm.write(line, file=sys.stderr)
 
         if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         state = start(group, actors, overwrite, note)
-        if state.step < setup.schedule.steps and (lines := shared(numbers, folders, device)):
+        if state.step < setup.schedule.steps and (lines := shared(numbers, folders, ways.device)):
             note(lines)
-        run(group, state, note, progress=progress, track=track, callback=callback)
+        run(group, state, note)
