@@ -108,7 +108,7 @@ def table(name: str) -> str:
     anchors = "sac" in means and "random" in means
     normalised = ["normalised, 95 % interval"] if anchors else []
     titles = ["agent", "mean return", *normalised, "each seed", "delay", "steps"]
-    lines = ["| " + " | ".join(titles) + " |", "| --- " * len(titles) + "|"]
+    body = []
     for agent, runs in sorted(by_agent.items(), key=lambda item: -np.mean(means[item[0]])):
         config, evaluation = runs[0]
         own = means[agent][:1] if agent == "random" else means[agent]  # which was evaluated alike for every seed
@@ -121,8 +121,8 @@ def table(name: str) -> str:
             known = agent not in ("random", "sac") and np.isfinite(ends).all()
             cells.append(f"{value:.2f}" + (f" ({ends[0]:.2f} to {ends[1]:.2f})" if known else ""))
         cells += [seeds, evaluation["delay"], f"{config['schedule']['steps']:,}"]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+        body.append(cells)
+    return markdown_table(titles, body)
 
 
 def draw_against_delay(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
@@ -170,32 +170,31 @@ def entropies(name: str) -> str:
     for row in rows:
         unit = configs[row["run"]]["hyperparameters"]["entropy_unit"]
         episodes[unit][configs[row["run"]]["seed"]][row["step"]].append(row["return"])
-    lines = ["| `--entropy-unit` | seeds | mean return over training | after training |", "| --- | --- | --- | --- |"]
+    body = []
     for unit, seeds in sorted(episodes.items()):
         steps, returns = common_steps([{step: float(np.mean(x)) for step, x in run.items()} for run in seeds.values()])
         columns = (area(steps, returns), returns[:, -1])
-        cells = [f"`{unit}`", str(len(returns)), *(f"{x.mean():.1f} ± {x.std(ddof=1):.1f}" for x in columns)]
-        lines.append("| " + " | ".join(cells) + " |")
+        body.append([f"`{unit}`", len(returns), *(f"{x.mean():.1f} ± {x.std(ddof=1):.1f}" for x in columns)])
+    table = markdown_table(["`--entropy-unit`", "seeds", "mean return over training", "after training"], body)
     one = configs[0]
     about = f"{one['env']}, `{one['agent']}`, preset `{one['preset']}`, {one['schedule']['steps']:,} steps"
-    return "\n".join(lines) + f"\n\n{about}. Rows: `benchmarks/results/{name}.jsonl`."
+    return f"{table}\n\n{about}. Rows: `benchmarks/results/{name}.jsonl`."
 
 
 def overhead() -> str:
     """Return a Markdown table of what the wrappers cost."""
     first, *lines = [json.loads(line) for line in (HERE / "results" / "overhead.jsonl").read_text().splitlines()]
-    rows = ["| wrapper, delay | environments | ratio of times | quartiles |", "| --- | --- | --- | --- |"]
+    body = []
     for line in lines:
         low, high = line["quartiles"]
-        rows.append(f"| `{line['wrapper']}` | {line['environments']} | {line['ratio']:.2f} | {low:.2f} to {high:.2f} |")
+        body.append([f"`{line['wrapper']}`", line["environments"], f"{line['ratio']:.2f}", f"{low:.2f} to {high:.2f}"])
+    table = markdown_table(["wrapper, delay", "environments", "ratio of times", "quartiles"], body)
     versions = first["versions"]
     libraries = f"NumPy {versions['numpy']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}"
     where = (
         f"{versions['cores']} shared x86 cores, Python {versions['python']}, {libraries}, commit {versions['commit']}"
     )
-    return "\n".join(rows) + (
-        f"\n\nProcessor time, {first['rounds']} rounds; {where}. Rows: `benchmarks/results/overhead.jsonl`."
-    )
+    return f"{table}\n\nProcessor time, {first['rounds']} rounds; {where}. Rows: `benchmarks/results/overhead.jsonl`."
 
 
 @functools.cache
@@ -235,11 +234,8 @@ def relative_costs(env: str, delays: tuple[int, ...]) -> str:
 
 def udp_table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table of the UDP demonstration: each network and controller over its episodes."""
-    head, rows = lines[0], [line for line in lines if "statistics" in line]
-    table = [
-        "| observations | policy | mean return | worst | age (steps) | overruns |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    about_all, rows = lines[0], [line for line in lines if "statistics" in line]
+    body = []
     for row in rows:
         key = (row["scenario"], row["controller"])
         played = [line for line in lines if "return" in line and (line["scenario"], line["controller"]) == key]
@@ -252,35 +248,34 @@ def udp_table(lines: list[dict[str, Any]]) -> str:
         }[row["controller"]]
         overruns = f"{statistics['overruns']:,} of {statistics['decisions']:,}"
         held = f"; {sum(episode['held'] for episode in played):,} actions too late" if row["real_time"] else ""
-        cells = [row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held]
-        table.append("| " + " | ".join(cells) + " |")
-    policy, versions = head["policy"], head["versions"]
+        body.append([row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held])
+    policy, versions = about_all["policy"], about_all["versions"]
     about = (
-        f"{head['episodes']} episodes each, the best possible is 1000; `{policy['agent']}` trained with delay "
+        f"{about_all['episodes']} episodes each, the best possible is 1000; `{policy['agent']}` trained with delay "
         f"{policy['delay']}, preset `{policy['preset']}`, seed {policy['seed']}; `on_overrun` is `clip`; "
         f"{versions['cores']} shared x86 cores, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, "
         f"commit {versions['commit']}. Rows: `benchmarks/results/udp.jsonl`."
     )
-    return "\n".join(table) + "\n\n" + about
+    head = ["observations", "policy", "mean return", "worst", "age (steps)", "overruns"]
+    return f"{markdown_table(head, body)}\n\n{about}"
 
 
 def overruns_table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table of mean returns on links slower than the trained delay, by the answer to it."""
     policy, versions, rows = lines[0]["policy"], lines[0]["versions"], lines[1:]
-    table = ["| travel time, steps | `clip` | `hold` | the last Δ actions |", "| --- | --- | --- | --- |"]
+    body = []
     for i in range(0, len(rows), 3):
         link = rows[i]["link"]
         assert [row["answer"] for row in rows[i : i + 3]] == ["clip", "hold", "last"]
         words = f"{link['low']} to {link['high']}" if link["low"] < link["high"] else f"{link['low']}"
         lost = f", {100 * link['loss']:.0f} % lost" if link["loss"] else ""
-        means = [f"{np.mean(row['returns']):.0f}" for row in rows[i : i + 3]]
-        table.append("| " + " | ".join([words + lost, *means]) + " |")
+        body.append([words + lost, *(f"{np.mean(row['returns']):.0f}" for row in rows[i : i + 3])])
     about = (
         f"{policy['env']}, {len(rows[0]['returns'])} episodes each, the best possible is 1000; `{policy['agent']}` "
         f"trained with delay {policy['delay']}, preset `{policy['preset']}`, seed {policy['seed']}; "
         f"MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: `benchmarks/results/overruns.jsonl`."
     )
-    return "\n".join(table) + "\n\n" + about
+    return f"{markdown_table(['travel time, steps', '`clip`', '`hold`', 'the last Δ actions'], body)}\n\n{about}"
 
 
 def insert(page: Path, key: str, text: str) -> None:

@@ -26,6 +26,7 @@ from delayrl.deploy.export import bundle_files
 from delayrl.deploy.files import write_files
 from delayrl.deploy.latency import latency
 from delayrl.play.policy import Policy
+from delayrl.report.markdown import markdown_table
 from delayrl.run.provenance import versions
 
 ROWS = HERE / "results" / "latency.jsonl"
@@ -87,7 +88,7 @@ def measure(tries: int, decisions: int) -> None:
 def table() -> str:
     """Return a Markdown table: medians over the tries, with the lowest and highest values."""
     head, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
-    lines = ["| policy | Δ | backend | p50 ms | p99 ms | max ms | p99 of processor time, ms |", "|" + " --- |" * 7]
+    body = []
     for name in NAMES:
         for delay in DELAYS:
             for backend in WORDS:
@@ -98,20 +99,20 @@ def table() -> str:
                 for key in KEYS:
                     values = [row[key] for row in measured]
                     cells.append(f"{np.median(values):.2f} ({min(values):.2f}–{max(values):.2f})")
-                lines.append("| " + " | ".join(map(str, cells)) + " |")
+                body.append(cells)
     package, tries = head["versions"], 1 + max(row["try"] for row in rows)
     loads = [row["load"] for row in rows]
-    lines += [
-        "",
+    titles = ["policy", "Δ", "backend", "p50 ms", "p99 ms", "max ms", "p99 of processor time, ms"]
+    about = (
         f"Preset `paper`, {SIZES[0]} observations, {SIZES[1]} actions, age Δ, fresh weights; the task's control "
         f"period is {1000 * head['dt']:g} ms. Median of {tries} tries of {head['decisions']:,} decisions each "
         f"(lowest–highest), back to back, on one thread of one core of a machine with {package['cores']} shared x86 "
         f"cores and no GPU (load average {min(loads):.1f}–{max(loads):.1f} meanwhile). "
         f"NumPy {package['numpy']}, onnxruntime "
         f"{package.get('onnxruntime', '-')}, jax {package['jax']}, g++ {package.get('compiler', '-')} with "
-        f"`-O3 -march=native`. Rows: `benchmarks/results/latency.jsonl`.",
-    ]
-    return "\n".join(lines)
+        f"`-O3 -march=native`. Rows: `benchmarks/results/latency.jsonl`."
+    )
+    return f"{markdown_table(titles, body)}\n\n{about}"
 
 
 def main() -> None:

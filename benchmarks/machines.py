@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from figures import HERE, insert
 
+from delayrl.report.markdown import markdown_table
+
 ROWS = HERE / "results" / "machines.jsonl"
 WORKS = [("sac", 0, "small"), ("vdpo", 5, "small"), ("vdpo", 25, "small"), ("any-age", 25, "small")]
 SEEDS = (1, 4, 8)
@@ -103,16 +105,16 @@ def table() -> str:
     about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
     ways = list(dict.fromkeys((row["processes"], row["seeds"]) for row in rows))
     heads = [f"{processes} × {seeds}" for processes, seeds in ways]
-    lines = ["| agent | Δ | " + " | ".join(heads) + " |", "| --- | --- |" + " --- |" * len(ways)]
+    body = []
     for agent, delay in dict.fromkeys((row["agent"], row["delay"]) for row in rows):
         own = [row for row in rows if (row["agent"], row["delay"]) == (agent, delay)]
         medians = [np.median([row["speed"] for row in own if (row["processes"], row["seeds"]) == way]) for way in ways]
         cells = [f"**{m:,.0f}**" if m == max(medians) else f"{m:,.0f}" for m in medians]
-        lines.append(f"| `{agent}` | {delay} | {' | '.join(cells)} |")
+        body.append([f"`{agent}`", delay, *cells])
     rounds = 1 + max(row["round"] for row in rows)
     words = f"Seed-steps a second, processes × seeds of each; median of {rounds} rounds of {about['seconds']} s of "
     words += f"learning, HalfCheetah-v5, preset `small`; {about['cpus']} x86 cores, jax {about['versions']['jax']}. "
-    return "\n".join(lines) + f"\n\n{words}Rows: `benchmarks/results/machines.jsonl`."
+    return f"{markdown_table(['agent', 'Δ', *heads], body)}\n\n{words}Rows: `benchmarks/results/machines.jsonl`."
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from delayrl.envs import make as make_task
 from delayrl.errors import DelayRLError
 from delayrl.measure import from_log
 from delayrl.measure.reading import read_signals
+from delayrl.report.markdown import markdown_table
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "measure.jsonl"
@@ -162,13 +163,12 @@ def score(lines: list[dict[str, Any]], method: str) -> str:
 
 def table(groups: list[tuple[str, list[dict[str, Any]]]], head: str) -> str:
     """Return a Markdown table with one group of logs per line."""
-    text = [f"| {head} | logs | dead time | peak of increments | peak of levels | in the interval |"]
-    text.append("| --- | --- | --- | --- | --- | --- |")
+    body = []
     for name, lines in groups:
         inside = [line["low"] <= line["delay"] <= line["high"] for line in lines if "low" in line]
-        cells = [name, len(lines), *(score(lines, method) for method in METHODS), f"{np.mean(inside):.0%}"]
-        text.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(text)
+        body.append([name, len(lines), *(score(lines, method) for method in METHODS), f"{np.mean(inside):.0%}"])
+    titles = [head, "logs", "dead time", "peak of increments", "peak of levels", "in the interval"]
+    return markdown_table(titles, body)
 
 
 def tables() -> None:

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from figures import HERE, insert
 
+from delayrl.report.markdown import markdown_table
+
 ROWS = HERE / "results" / "ppo.jsonl"
 VIEWS = ("blind", "augmented", "privileged")
 
@@ -40,7 +42,7 @@ def table() -> str:
     for row in rows:
         curves[row["task"], row["delay"], row["view"]][row["seed"]][row["step"]] = row["return"]
         seconds[row["task"]][row["delay"], row["view"], row["seed"]] = row["seconds"]
-    lines = ["| task | delay | steps | PPO | return | mean over training | each seed |", "|" + " --- |" * 7]
+    body = []
     for task, delay, view in sorted(curves, key=lambda key: (key[0], key[1] != "0", VIEWS.index(key[2]))):
         seeds = [list(curve.values()) for curve in curves[task, delay, view].values()]
         last, mean = np.array([curve[-1] for curve in seeds]), np.array([np.mean(curve) for curve in seeds])
@@ -48,13 +50,14 @@ def table() -> str:
         each = " · ".join(f"{value:,.0f}" for value in last)
         spread = [f"{x.mean():,.0f}" + (f" ± {x.std(ddof=1):,.0f}" if len(x) > 1 else "") for x in (last, mean)]
         kind = view if delay != "0" else "no delay"
-        lines.append(f"| {task} | {delay} | {steps:,} | {kind} | {spread[0]} | {spread[1]} | {each} |")
+        body.append([task, delay, f"{steps:,}", kind, *spread, each])
     took = ", ".join(f"{task} {np.median([*runs.values()]) / 60:.0f} min" for task, runs in sorted(seconds.items()))
     used = about["versions"][0]
     commits = ", ".join(sorted({made["commit"] for made in about["versions"]}))
     made = f"A run took, on a core (median): {took}. Made with brax {used['brax']}, jax {used['jax']}, "
     made += f"{used['cores']} x86 cores, commit {commits}. Rows: `benchmarks/results/ppo.jsonl`."
-    return "\n".join(lines) + f"\n\nEach return is the mean of 128 episodes with deterministic actions. {made}"
+    table = markdown_table(["task", "delay", "steps", "PPO", "return", "mean over training", "each seed"], body)
+    return f"{table}\n\nEach return is the mean of 128 episodes with deterministic actions. {made}"
 
 
 if __name__ == "__main__":

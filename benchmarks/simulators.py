@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from figures import HERE, insert
 
+from delayrl.report.markdown import markdown_table
+
 ROWS = HERE / "results" / "simulators.jsonl"
 DELAYS = ("5", "50", "uniform:1:5", "uniform:1:50", "episode:1:5+action=episode:0:5")
 ROBOTS = (1024, 4096)
@@ -67,8 +69,7 @@ def table() -> str:
         made = json.loads(line)
         about, rows = made["about"], made["rows"]
         clock = "processor" if about["device"] == "cpu" else "wall"
-        lines = ["| robots | without, ms a step | " + " | ".join(f"`{delay}`" for delay in DELAYS) + " |"]
-        lines.append("| --- |" * 1 + " --- |" * (1 + len(DELAYS)))
+        body = []
         for robots in ROBOTS:
             times = {
                 delay: np.array([row[clock] for row in rows if (row["robots"], row["delay"]) == (robots, delay)])
@@ -76,11 +77,12 @@ def table() -> str:
             }
             plain = 1000 * np.median(times[""]) / about["steps"]
             ratios = [f"{np.median(times[delay] / times['']):.2f}" for delay in DELAYS]
-            lines.append(f"| {robots:,} | {plain:.1f} | {' | '.join(ratios)} |")
+            body.append([f"{robots:,}", f"{plain:.1f}", *ratios])
         rounds = 1 + max(row["round"] for row in rows)
         kind = f"{about['cpus']} x86 cores, processor time" if clock == "processor" else f"{about['device']}, wall time"
         used = about["versions"]
-        parts.append("\n".join(lines) + f"\n\nMedian of {rounds} rounds in turn; {kind}; jax {used['jax']}.")
+        table = markdown_table(["robots", "without, ms a step", *(f"`{delay}`" for delay in DELAYS)], body)
+        parts.append(f"{table}\n\nMedian of {rounds} rounds in turn; {kind}; jax {used['jax']}.")
     return "\n\n".join(parts) + " Rows: `benchmarks/results/simulators.jsonl`."
 
 

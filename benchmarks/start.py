@@ -12,10 +12,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from figures import HERE, insert
+
+from delayrl.report.markdown import markdown_table
 
 ROWS = HERE / "results" / "start.jsonl"
 WORKS = [
@@ -101,27 +102,18 @@ def measure(rounds: int) -> None:
 def table() -> str:
     """Return the medians as Markdown."""
     about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
-    lines = [
-        "| agent | Δ | preset | compiling, s | compiled before, s | kept, MB |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    body = []
     for work in dict.fromkeys((row["agent"], row["delay"], row["preset"]) for row in rows):
         own = [row for row in rows if (row["agent"], row["delay"], row["preset"]) == work]
         medians = [np.median([row["seconds"] for row in own if row["kept"] is kept]) for kept in (False, True)]
         size = next(row["bytes"] for row in own if "bytes" in row)
-        cells: list[Any] = [
-            f"`{work[0]}`",
-            work[1],
-            f"`{work[2]}`",
-            *(f"{m:.1f}" for m in medians),
-            f"{size / 1e6:.1f}",
-        ]
-        lines.append(f"| {' | '.join(map(str, cells))} |")
+        body.append([f"`{work[0]}`", work[1], f"`{work[2]}`", *(f"{m:.1f}" for m in medians), f"{size / 1e6:.1f}"])
+    table = markdown_table(["agent", "Δ", "preset", "compiling, s", "compiled before, s", "kept, MB"], body)
     rounds = 1 + max(row["round"] for row in rows)
     words = (
         f"Median of {rounds} rounds, HalfCheetah-v5; {about['cpus']} x86 cores, Python {about['versions']['python']}, "
     )
-    return "\n".join(lines) + f"\n\n{words}jax {about['versions']['jax']}. Rows: `benchmarks/results/start.jsonl`."
+    return f"{table}\n\n{words}jax {about['versions']['jax']}. Rows: `benchmarks/results/start.jsonl`."
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from scipy import stats
 
 from delayrl.report import statistics
+from delayrl.report.markdown import markdown_table
 
 COLOURS = {"delayrl": "#1f6feb", "SBX": "#d1242f", "Stable-Baselines3": "#1a7f37", "delayrl, matched": "#8250df"}
 COLOURS |= {"delayrl, matched, bfloat16": "#c07ff0", "delayrl, small": "#9a6700"}
@@ -61,7 +62,7 @@ def table(runs: Runs) -> str:
     """Return a Markdown table: area and final return by task and library, and its difference from the base."""
     head = ["task", "SAC of", "seeds", "mean return over training", "after training"]
     head.append("difference over training, 95 % interval")
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    body = []
     for task, by_name in sorted(runs.items()):
         areas = {}
         for who in sorted(by_name, key=list(COLOURS).index):
@@ -70,8 +71,8 @@ def table(runs: Runs) -> str:
             cells = [task, who, str(len(returns)), spread(areas[who]), spread(returns[:, -1])]
             base = BASE.get(who, "delayrl")
             compared = difference(areas[who], areas.get(base)) if who != "delayrl" else ""
-            lines.append("| " + " | ".join([*cells, compared and f"{compared} against {base}"]) + " |")
-    return "\n".join(lines)
+            body.append([*cells, compared and f"{compared} against {base}"])
+    return markdown_table(head, body)
 
 
 def spread(values: statistics.Floats) -> str:

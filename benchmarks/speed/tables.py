@@ -13,6 +13,7 @@ from matplotlib import pyplot
 from speed.works import OWN, SIZES
 
 from delayrl.bench.results import read_table
+from delayrl.report.markdown import markdown_table
 
 RESULTS = Path(__file__).parent.parent / "results"
 Row = dict[str, Any]
@@ -27,7 +28,7 @@ def read_rows(name: str = "speed") -> list[Row]:
 def compared(rows: list[Row], names: tuple[str, str] = ("ours", "peer")) -> str:
     """Return a Markdown table of both sides of each work, by default ours beside each peer."""
     sides = f"work; {names[1]}|device|threads|{names[0]}, steps/s|{names[1]}, steps/s"
-    lines = head(f"{sides}|ratio (quartiles)|of processor time|slices|load")
+    body = []
     for row in (r for r in rows if not r["work"].startswith("size-")):
         cells = [row["title"], row["device"], row["threads"], f"{row['ours']['steps_per_second']:.1f}"]
         if "peer" in row:
@@ -36,9 +37,8 @@ def compared(rows: list[Row], names: tuple[str, str] = ("ours", "peer")) -> str:
             cells += [spread(row["ratio"]), spread(row["processor_ratio"])]
         else:
             cells += ["", "", ""]
-        cells += [len(row["ours"]["slices"]), f"{row['load']['median']:.1f}"]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+        body.append([*cells, len(row["ours"]["slices"]), f"{row['load']['median']:.1f}"])
+    return markdown_table(f"{sides}|ratio (quartiles)|of processor time|slices|load".split("|"), body)
 
 
 def behind(rows: list[Row]) -> str:
@@ -56,12 +56,6 @@ def behind(rows: list[Row]) -> str:
             line += f"{names.get(longest, longest)}."
         lines.append(line)
     return "\n\n".join(lines)
-
-
-def head(columns: str) -> list[str]:
-    """Return the two header lines of a Markdown table with columns separated by `|`."""
-    names = columns.split("|")
-    return ["| " + " | ".join(names) + " |", "| " + " | ".join("---" for _ in names) + " |"]
 
 
 def spread(value: dict[str, float]) -> str:
@@ -82,23 +76,18 @@ def where(row: Row, rows: list[Row]) -> str:
 
 def resources(rows: list[Row]) -> str:
     """Return a Markdown table of processor time and peak memory of both sides."""
-    lines = [
-        *head("work; peer|ours, processor ms/step|peer, processor ms/step|ours, peak MB|peer, peak MB"),
-    ]
+    body = []
     for row in (r for r in rows if "peer" in r):
         sides = row["ours"], row["peer"]
-        cells = [f"{1e3 * s['processor']['median']:.1f}" for s in sides] + [
-            f"{s['peak_bytes'] / 1e6:.0f}" for s in sides
-        ]
-        lines.append(f"| {row['title']}{where(row, rows)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        times = [f"{1e3 * s['processor']['median']:.1f}" for s in sides]
+        body.append([row["title"] + where(row, rows), *times, *(f"{s['peak_bytes'] / 1e6:.0f}" for s in sides)])
+    head = ["work; peer", "ours, processor ms/step", "peer, processor ms/step", "ours, peak MB", "peer, peak MB"]
+    return markdown_table(head, body)
 
 
 def parts(rows: list[Row]) -> str:
     """Return a Markdown table of the parts of our step, and those that the peer times."""
-    lines = [
-        *head("work|act|environment|SAC and belief|cloning|their sum|whole step|peer's parts"),
-    ]
+    body = []
     for row in (r for r in rows if r.get("floor") and not r["work"].startswith("size-")):
         seconds, seeds = row["floor"]["parts"], row["ours"]["seeds"]
         names = ("act", "environment", "phase 0", "phase 1")
@@ -107,8 +96,9 @@ def parts(rows: list[Row]) -> str:
         theirs = row.get("peer", {}).get("parts", {})
         words = {"train_sac": "SAC", "train_belief": "belief", "train_kl": "cloning"}
         cells.append(", ".join(f"{words[n]} {1e3 * theirs[n]['median']:.1f}" for n in words if n in theirs))
-        lines.append(f"| {row['title'].split(';')[0]}{where(row, rows)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        body.append([row["title"].split(";")[0] + where(row, rows), *cells])
+    head = ["work", "act", "environment", "SAC and belief", "cloning", "their sum", "whole step", "peer's parts"]
+    return markdown_table(head, body)
 
 
 def floor_seconds(row: Row) -> float:
@@ -130,21 +120,21 @@ def best_rate(row: Row) -> float:
 
 def floors(rows: list[Row]) -> str:
     """Return a Markdown table of each work beside its floor, with the rates of its own shapes."""
-    lines = [
-        *head("work|GFLOP/step|floor, ms|processor, ms|times the floor|squares|forward|weights'|inputs'"),
-    ]
+    head = ["work", "GFLOP/step", "floor, ms", "processor, ms", "times the floor"]
+    head += ["squares", "forward", "weights'", "inputs'"]
+    body: list[list[str]] = []
     for row in (r for r in rows if r.get("floor") and not r["work"].startswith("size-")):
         least, rates = floor_seconds(row), row["floor"]["rates"]
         ours, words = spent(row), "" if row["device"] == "cpu" else " (whole step)"
         cells = [f"{row['floor']['flops'] / 1e9:.3f}", f"{1e3 * least:.2f}", f"{1e3 * ours:.2f}{words}"]
         cells += [f"{ours / least:.1f}"]
         cells += [f"{rates[name] / 1e9:.0f}" for name in ("square", "forward", "weights", "inputs")]
-        lines.append(f"| {row['title'].split(';')[0]}{where(row, rows)} | " + " | ".join(cells) + " |")
+        body.append([row["title"].split(";")[0] + where(row, rows), *cells])
     best: dict[str, float] = {}
     for row in (r for r in rows if r.get("floor")):
         best[row["device"]] = max(best_rate(row), best.get(row["device"], 0))
     words = " and ".join(f"{v / 1e9:.0f} GFLOP/s{f' ({d})' if len(best) > 1 else ''}" for d, v in best.items())
-    return "\n".join([*lines, "", f"The best rate seen: {words}."])
+    return f"{markdown_table(head, body)}\n\nThe best rate seen: {words}."
 
 
 def operations() -> str:
@@ -154,15 +144,16 @@ def operations() -> str:
     kinds = sorted(
         {k for row in rows for k in row["kinds"]}, key=lambda k: -max(r["kinds"].get(k, [0])[0] for r in rows)
     )
-    lines = [*head("|".join(["work", "update", "whole, ms", "GFLOP", *(f"{kind}, ms (calls)" for kind in kinds)]))]
+    body = []
     for row in rows:
         phase = names[row["phase"]] if row["title"].startswith("VDPO") else "SAC"
         cells = [row["title"], phase, f"{row['milliseconds']:.1f}", f"{row['gflop']:.2f}"]
         cells += [f"{row['kinds'][k][0]:.2f} ({row['kinds'][k][1]:.0f})" if k in row["kinds"] else "" for k in kinds]
-        lines.append("| " + " | ".join(cells) + " |")
+        body.append(cells)
+    table = markdown_table(["work", "update", "whole, ms", "GFLOP", *(f"{kind}, ms (calls)" for kind in kinds)], body)
     loads = [row["load"] for row in rows]
-    lines += ["", f"Commit {commits(rows)}; load before each: {min(loads):.1f} to {max(loads):.1f}."] if rows else []
-    return "\n".join(lines)
+    about = f"\n\nCommit {commits(rows)}; load before each: {min(loads):.1f} to {max(loads):.1f}." if rows else ""
+    return table + about
 
 
 def trial(grid: str, option: str, default: int, before: str = "", *, timed: bool) -> str:
@@ -174,7 +165,7 @@ def trial(grid: str, option: str, default: int, before: str = "", *, timed: bool
     if not ended:
         return ""
     titles = f"task|`--{option.replace('_', '-')}`|mean of all evaluations|last evaluation|last, each seed"
-    lines = head(titles + "|seed-steps/s" * timed)
+    body = []
     for cell, progress in ended:
         returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
         for row in (row for row in rows if row["cell"] == cell.id and row["policy"] == "agent"):
@@ -183,28 +174,27 @@ def trial(grid: str, option: str, default: int, before: str = "", *, timed: bool
         last, speed, condition = means[max(means)], progress.speed, cell.condition
         cells = [f"{condition.env}, Δ = {condition.delay}", str(condition.overrides.get(option, default))]
         cells += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}", " · ".join(f"{x:.1f}" for x in last)]
-        cells += [f"{speed * len(cell.seeds):.0f}" if speed else ""] * timed
-        lines.append("| " + " | ".join(cells) + " |")
+        body.append(cells + [f"{speed * len(cell.seeds):.0f}" if speed else ""] * timed)
     commit = commits([{"versions": versions} for versions in used])
     about = f"VDPO, preset `{condition.preset}`, {len(cell.seeds)} seeds in lockstep. Commit {commit}."
     about = f"{about} Rows: `benchmarks/results/{table.name}`."
-    return "\n".join([*([before, ""] if before else []), *lines, "", about])
+    results = markdown_table((titles + "|seed-steps/s" * timed).split("|"), body)
+    return "\n\n".join([*([before] if before else []), results, about])
 
 
 def precision() -> str:
     """Return a Markdown table of the error of coarser products, from the rows of benchmarks/precision.py."""
     rows = read_rows("precision")
-    lines = head("`--precision`|actions|gradient of the belief's loss")
-    lines += [f"| `{row['precision']}` | {row['action']:.1e} | {row['gradient']:.1e} |" for row in rows]
-    return "\n".join([*lines, "", f"Commit {commits(rows)}. Rows: `benchmarks/results/precision.jsonl`."])
+    body = [[f"`{row['precision']}`", f"{row['action']:.1e}", f"{row['gradient']:.1e}"] for row in rows]
+    table = markdown_table(["`--precision`", "actions", "gradient of the belief's loss"], body)
+    return f"{table}\n\nCommit {commits(rows)}. Rows: `benchmarks/results/precision.jsonl`."
 
 
 def sizes(rows: list[Row]) -> str:
     """Return a Markdown table of cost against Δ, seeds and task; cells that were not run are empty."""
-    lines = [
-        *head("preset|task|Δ|seeds|ms/step of a seed|seed-steps/s|processor ms/step|floor, ms|replay|peak MB"),
-    ]
-    measured = once(rows)
+    head = ["preset", "task", "Δ", "seeds", "ms/step of a seed", "seed-steps/s", "processor ms/step", "floor, ms"]
+    head += ["replay", "peak MB"]
+    body, measured = [], once(rows)
     for name, work in SIZES.items():
         side, row = work.sides["ours"], measured.get(name)
         cells = [f"`{side['preset']}`", side["env"], side["delay"], side["seeds"]]
@@ -214,8 +204,8 @@ def sizes(rows: list[Row]) -> str:
             cells += [f"{1e3 * ours['processor']['median']:.1f}"]
             cells += [f"{1e3 * floor_seconds(row):.2f}", f"{floor['replay_bytes'] / 1e9:.2f} GB"] if floor else ["", ""]
             cells += [f"{ours['peak_bytes'] / 1e6:.0f}"]
-        lines.append("| " + " | ".join(map(str, cells + [""] * (10 - len(cells)))) + " |")
-    return "\n".join(lines)
+        body.append(cells + [""] * (len(head) - len(cells)))
+    return markdown_table(head, body)
 
 
 def draw_sizes(rows: list[Row], out: Path) -> None:
@@ -268,12 +258,12 @@ def replay(obs_size: int, action_size: int, delay: int, rows: int) -> tuple[int,
 
 def memory() -> str:
     """Return a Markdown table of the replay of a million steps."""
-    lines = ["| task | Δ | ours | released code | ratio |", "| --- | --- | --- | --- | --- |"]
+    body = []
     tasks = (("HalfCheetah-v5", 17, 6), ("Humanoid-v5", 348, 17))
     for (task, obs_size, action_size), delay in ((t, d) for t in tasks for d in (5, 25, 50)):
         ours, theirs = replay(obs_size, action_size, delay, 1_000_000)
-        lines.append(f"| {task} | {delay} | {ours / 1e9:.2f} GB | {theirs / 1e9:.1f} GB | {theirs / ours:.0f} |")
-    return "\n".join(lines)
+        body.append([task, delay, f"{ours / 1e9:.2f} GB", f"{theirs / 1e9:.1f} GB", f"{theirs / ours:.0f}"])
+    return markdown_table(["task", "Δ", "ours", "released code", "ratio"], body)
 
 
 def provenance(rows: list[Row]) -> str:

@@ -57,9 +57,9 @@ def _escape(text: object) -> str:
     return re.sub(r"([\\`*_\[\]|~$#!])", r"\\\1", plain)
 
 
-def markdown_table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], body: Iterable[Sequence[object]]) -> str:
     """Write a table of cells that are Markdown already."""
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---" for _ in head], *body))
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, ["---" for _ in head], *body))
 
 
 def _paper_table(summary: Summary, table: Table) -> str:
