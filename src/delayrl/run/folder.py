@@ -244,11 +244,12 @@ def _below(path: Path) -> list[Path]:
 
 
 def is_config(file: Path) -> bool:
-    """Whether a file is the configuration of a run, of any version."""
+    """Whether a file is the configuration of a run, of any version: damaged, it stands beside a run's rows."""
     try:
-        return CONFIG.keys() <= json.loads(file.read_text()).keys()
+        whole = CONFIG.keys() <= json.loads(file.read_text()).keys()
     except (ValueError, OSError, AttributeError):
-        return False
+        whole = False
+    return whole or (file.parent / "rows.jsonl").exists()
 
 
 def _delete_checkpoint(path: Path) -> None:
