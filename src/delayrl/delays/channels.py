@@ -113,9 +113,7 @@ class Delay:
                 channel = Channel()  # all ways to write no delay are equal
             object.__setattr__(self, name, channel)
         if self.reward.rule == "raw" and self.reward.maximum:
-            raise DelayRLError(
-                "rewards arrive as newest, fifo or wait: with raw some would be lost and others come twice"
-            )
+            raise DelayRLError("rewards arrive as newest, fifo or wait: raw would lose some and repeat others")
 
     @property
     def maximum(self) -> int:

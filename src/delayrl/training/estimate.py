@@ -11,7 +11,7 @@ from delayrl.training.cost import cost_of
 from delayrl.training.state import Group, TrainState
 
 UTILISATION = 0.25
-"""Share of the matmul rate that an update reaches on a CPU: between VDPO `small` and `paper` (docs/performance.md)."""
+"""Share of the matmul rate that updates reach on a CPU, between presets `small` and `paper` (docs/performance.md)."""
 
 
 def estimate(group: Group, state: TrainState) -> str:
