@@ -234,7 +234,7 @@ def relative_costs(env: str, delays: tuple[int, ...]) -> str:
 
 def udp_table(lines: list[dict[str, Any]]) -> str:
     """Return a Markdown table of the UDP demonstration: each network and controller over its episodes."""
-    about_all, rows = lines[0], [line for line in lines if "statistics" in line]
+    first, rows = lines[0], [line for line in lines if "statistics" in line]
     body = []
     for row in rows:
         key = (row["scenario"], row["controller"])
@@ -249,9 +249,9 @@ def udp_table(lines: list[dict[str, Any]]) -> str:
         overruns = f"{statistics['overruns']:,} of {statistics['decisions']:,}"
         held = f"; {sum(episode['held'] for episode in played):,} actions too late" if row["real_time"] else ""
         body.append([row["scenario"], words, f"{np.mean(returns):.0f}", f"{min(returns):.0f}", age, overruns + held])
-    policy, versions = about_all["policy"], about_all["versions"]
+    policy, versions = first["policy"], first["versions"]
     about = (
-        f"{about_all['episodes']} episodes each, the best possible is 1000; `{policy['agent']}` trained with delay "
+        f"{first['episodes']} episodes each, the best possible is 1000; `{policy['agent']}` trained with delay "
         f"{policy['delay']}, preset `{policy['preset']}`, seed {policy['seed']}; `on_overrun` is `clip`; "
         f"{versions['cores']} shared x86 cores, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, "
         f"commit {versions['commit']}. Rows: `benchmarks/results/udp.jsonl`."

@@ -62,8 +62,8 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
     every = [used for file in files for used in trained_with(file)]
     words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
     rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
-    made = "HalfCheetah-v5, preset `matched` with `--precision bfloat16`. ± is the standard deviation over seeds, each "
-    made += f"of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
+    made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
+    made += f"seeds, each of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
     slower = update_times(files[0].parent / "arms.jsonl")
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners), f"{front(shown)}\n\n{made}"

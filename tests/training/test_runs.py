@@ -56,7 +56,7 @@ def test_what_is_no_run(vdpo: Run, tmp_path: Path) -> None:
                 use(thing)
 
 
-def test_a_damaged_run_is_listed(vdpo: Run, tmp_path: Path) -> None:
+def test_a_damaged_run_is_listed(tmp_path: Path) -> None:
     """One that vanished from the list would be taken for deleted. A config.json of others is left out."""
     for name in ("ours", "others"):
         (tmp_path / name).mkdir()

@@ -1,6 +1,7 @@
 """The interface between agents and the training loop. Agents implement the protocol `Agent`; they inherit nothing."""
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -90,7 +91,7 @@ class Schedule:
 
     steps: Annotated[int, "environment steps to train"] = 1_000_000
     random_steps: Annotated[int, "initial steps with uniformly random actions"] = 5_000
-    update_after: Annotated[int, "steps before the first update; 0 for random_steps", (0, float("inf"))] = 0
+    update_after: Annotated[int, "steps before the first update; 0 for random_steps", (0, math.inf)] = 0
     replay_capacity: Annotated[int, "rows of the replay: one per step, and one more per episode"] = 1_000_000
     evaluate_every: Annotated[int, "steps between evaluations (and checkpoints)"] = 10_000
     evaluation_episodes: Annotated[int, "episodes per evaluation"] = 10

@@ -66,7 +66,8 @@ def go_on(
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     numbers = [config["seed"] for config in configs]
-    train_group(setup, numbers, runs, Ways(device, track, threads, slim, callback, progress), further=True)
+    ways = Ways(device=device, track=track, threads=threads, slim=slim, callback=callback, progress=progress)
+    train_group(setup, numbers, runs, ways, further=True)
     ended = [Run(one.path) for one in runs]
     return ended[0] if runs[0].path == path_of(run) else ended
 

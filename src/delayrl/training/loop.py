@@ -39,18 +39,13 @@ def run(group: Group, state: TrainState, note: Callable[[str], None]) -> None:
         StoppedError: the process was asked to stop; the newest step is stored.
         DelayRLError: NaN, a full disk, episodes too short to learn from.
     """
-    steps = group.setup.schedule.steps
+    steps, ways = group.setup.schedule.steps, group.ways
     if state.step < steps:
-        loop = Loop(group, state, Recorder(group, state.learner.agent, state.actors[0].env, group.ways.track))
-        if group.ways.progress:
+        loop = Loop(group, state, Recorder(group, state.learner.agent, state.actors[0].env, ways.track))
+        if ways.progress:
             note(f"estimate: {estimate(group, state)}")
         interval = 0.5 if sys.stderr.isatty() else 30
-        options = {
-            "disable": not group.ways.progress,
-            "smoothing": 0.05,
-            "dynamic_ncols": True,
-            "mininterval": interval,
-        }
+        options = {"disable": not ways.progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
         bar = tqdm(total=steps, initial=state.step, unit="step", **options)
         with stop_signal() as stop, bar:
             loop.train(stop.is_set, bar)

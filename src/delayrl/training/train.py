@@ -103,7 +103,7 @@ def train(
     if start_from is not None:
         origin, source = source_of(RunFolder(path_of(start_from)), [] if overwrite else folders)
         setup = replace(setup, origin={"from": origin})
-    ways = Ways(device, track, threads, slim, callback, progress)
+    ways = Ways(device=device, track=track, threads=threads, slim=slim, callback=callback, progress=progress)
     train_group(setup, numbers, folders, ways, given=delay, overwrite=overwrite, source=source)
     runs = [Run(folder.path) for folder in folders]
     return runs[0] if seeds == 1 else runs
