@@ -205,7 +205,7 @@ def test_latency(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert (ages_of(3), ages_of(5), ages_of(30)) == ([3], [5], [5, 25, 30])
     out = tmp_path / "bundle"
     export_run(run, out)
-    main(["latency", str(out), "--decisions", "40", "--period", "10"])
+    main(["latency", str(out), "--decisions", "40", "--period", "100Hz"])
     text = capsys.readouterr().out
     lines = [line.split() for line in text.splitlines()]
     assert [line[0] for line in lines[1:4]] == ["numpy", "onnx", "jax"]
@@ -258,8 +258,8 @@ def test_latency_refuses(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     out = tmp_path / "bundle"
     export_run(run, out)
     for options, message in (
-        (["--period", "0"], "milliseconds above 0"),
-        (["--period", "nan"], "milliseconds above 0"),
+        (["--period", "0ms"], "must be above 0; got 0 s"),
+        (["--period", "20"], "a time such as 20ms, 0.02s or 50Hz; got '20'"),
         (["--decisions", "0"], "decisions must lie"),
         (["--ages", "9", "--backend", "numpy"], "ages 0..3; got 9"),
         (["--backend", "torch"], "invalid choice"),

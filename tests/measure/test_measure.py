@@ -601,7 +601,10 @@ def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str
     path = log(tmp_path / "log.csv", *signals("servo", 4, 400))
     for option, words in (
         ("--period 20kg", "a time such as 20ms"),
-        ("--period 0", "a time in seconds"),
+        ("--period 0.02", "a time such as 20ms"),
+        ("--period 0Hz", "a time such as 20ms"),
+        ("--period 0s", "a time in seconds"),
+        ("--longest 20", "a time such as 200ms in a log; got 20"),
         ("--longest 1min", "a time such as"),
         ("--longest 10s", "too few to look for a delay"),
         ("--warm-up 7s", "too short"),

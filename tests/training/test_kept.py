@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 
 import delayrl
+from delayrl.envs import make
+from delayrl.play.policy import spec_of
 from delayrl.run.folder import RunFolder, hold
-from short_runs import train
+from delayrl.training import checks, machine
+from short_runs import TINY, train
 
 
 def stored(folder: Path) -> dict[str, str]:
@@ -57,6 +60,20 @@ def test_a_refused_overwrite_keeps_the_run(tmp_path: Path) -> None:
     (tmp_path / "seed1" / "notes.txt").write_text("mine")
     shutil.copytree(old.path, tmp_path / "seed0")
     assert_refused(tmp_path, "seed1 is not empty", lambda: train("bpql", tmp_path, seeds=2, overwrite=True))
+
+
+@pytest.mark.parametrize(("seeds", "words"), [(1, "the replay takes 0.0 GB"), (2, "replays of 2 seeds take 0.0 GB")])
+def test_a_replay_larger_than_the_memory(seeds: int, words: str, tmp_path: Path, monkeypatch) -> None:
+    """It would be killed without a word, or fail with a traceback."""
+    train("bpql", tmp_path / "old" / "seed0", steps=101)
+    monkeypatch.setattr(machine, "entry_points", lambda group: [])
+    spec = spec_of(make("Reacher-v5", 3))
+    size = TINY["replay_capacity"] * (4 * (spec.obs_size + spec.action_size) + 17) + 12  # with three counters
+    out = tmp_path / "old" / ("seed0" if seeds == 1 else "")
+    monkeypatch.setattr(checks, "free_memory", lambda: seeds * size - 1)
+    assert_refused(tmp_path, words, lambda: train("bpql", out, seeds=seeds, overwrite=True))
+    monkeypatch.setattr(checks, "free_memory", lambda: seeds * size)
+    train("bpql", tmp_path / "fits", steps=101, seeds=seeds)
 
 
 def test_a_run_may_begin_with_its_own_networks(tmp_path: Path) -> None:

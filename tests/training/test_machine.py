@@ -21,9 +21,10 @@ def test_containers_have_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limits of a control group count, where there are any."""
     whole, free = machine.cores(), machine.free_memory()
     says = {"cpu.max": "250000 100000", "memory.max": str(2**30), "memory.current": str(2**29)}
+    says["memory.stat"] = "file 7\ninactive_file 1024\nactive_file 7"
     monkeypatch.setattr(machine, "limit", says.get)
     assert machine.cores() == min(whole, 2)
-    assert machine.free_memory() == 2**29
+    assert machine.free_memory() == 2**29 + 1024
     says["cpu.max"] = "50000 100000"
     assert machine.cores() == 1
     says |= {"cpu.max": "max 100000", "memory.max": "max"}

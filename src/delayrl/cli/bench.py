@@ -114,7 +114,8 @@ def _report(grid: Grid | None, given: argparse.Namespace) -> None:
         rows, versions = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
         configs = configs_of(grid.cells, given.runs)
     page = report(rows, cells, given.out or folder / f"{name}-report", name, versions, configs)
-    print(f"open {page}; the same as Markdown is beside it")
+    done = sum(progress.state == "done" for _, progress in cells)
+    print(f"{name}: {done} of {len(cells)} cells are done\nopen {page}; the same as Markdown is beside it")
 
 
 def _run(grid: Grid, given: argparse.Namespace) -> None:

@@ -89,6 +89,17 @@ def whole(text: str) -> int:
     raise argparse.ArgumentTypeError(f"must be a whole number; got {text!r}")
 
 
+def seconds(text: str) -> float:
+    """Read a time such as 20ms, 0.02s or 50Hz."""
+    from delayrl.measure.reading import UNITS
+
+    match = re.fullmatch(rf"(\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)\s*({'|'.join(UNITS)}|hz)", text.strip().lower())
+    value = float(match[1]) if match else 0.0
+    if match is None or (match[2] == "hz" and not value):
+        raise argparse.ArgumentTypeError(f"must be a time such as 20ms, 0.02s or 50Hz; got {text!r}")
+    return 1 / value if match[2] == "hz" else value * UNITS[match[2]]
+
+
 class Numbers(argparse.Action):
     """Collect numbers that are separated by spaces, by commas, or by both: `32 32` and `32,32`."""
 

@@ -2,15 +2,13 @@
 
 import argparse
 import json
-import re
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
-from delayrl.cli.console import add_env_kwargs, add_wrappers, whole
+from delayrl.cli.console import add_env_kwargs, add_wrappers, seconds, whole
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.measure.log import Estimated, from_log, plot
@@ -30,13 +28,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add("--json", action="store_true", help="print one JSON object")
     add("--seed", type=whole, default=0, help="seed of the episodes, or of the bootstrap (default: 0)")
-    add("--longest", metavar="N|TIME", help="the longest delay to look for: steps (200), or time (100 rows of the log)")
+    words = "the longest delay to look for: steps (200), or time (100 rows of the log)"
+    add("--longest", type=_steps_or_seconds, metavar="N|TIME", help=words)
     environment = parser.add_argument_group("environment")
     environment.add_argument("--episodes", type=whole, help="episodes to play (default: 8)")
     add_env_kwargs(environment)
     add_wrappers(environment)
     add = parser.add_argument_group("log").add_argument
-    add("--period", metavar="TIME", help="control period, e.g. 20ms or 50Hz (default: the spacing of the rows)")
+    words = "control period, e.g. 20ms or 50Hz (default: the spacing of the rows)"
+    add("--period", type=seconds, metavar="TIME", help=words)
     add("--time", metavar="NAME", help="column of the time stamps (default: time, timestamp or t)")
     add("--commands", metavar="NAME", nargs="+", help="columns, or how they begin (default: command, cmd, action)")
     add("--observations", metavar="NAME", nargs="+", help="columns, or how they begin (default: observation, obs)")
@@ -44,7 +44,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--stamp", metavar="NAME", help="column of the time when an observation was made (default: stamp)")
     add("--received", metavar="NAME", help="column of the time when it arrived (default: received)")
     add("--unit", choices=list(UNITS), help="unit of the time stamps (default: s)")
-    add("--warm-up", metavar="TIME", help="time to leave out at the start (default: a twentieth of the log)")
+    words = "time to leave out at the start (default: a twentieth of the log)"
+    add("--warm-up", type=seconds, metavar="TIME", help=words)
     add("--plot", type=Path, metavar="FILE", help="plot the result as .png, .svg or .pdf")
     add("--save", type=Path, metavar="FILE", help="write the delays in steps, for --delay recorded:FILE")
 
@@ -54,9 +55,10 @@ def run(given: argparse.Namespace) -> None:
     path = Path(given.target)
     if path.is_file() or path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
         _refuse(given, ("episodes", "env_kwargs", "wrappers", "flatten"), "an environment", "a log")
-        columns = {name: getattr(given, name) for name in COLUMNS}
-        times: dict[str, Any] = {name: seconds(name, getattr(given, name)) for name in ("period", "longest", "warm_up")}
-        result = from_log(given.target, **columns, **times, unit=given.unit or "s", seed=given.seed)
+        if isinstance(given.longest, int):
+            raise DelayRLError(f"--longest is a time such as 200ms in a log; got {given.longest}")
+        options = {name: getattr(given, name) for name in (*COLUMNS, "period", "longest", "warm_up", "seed")}
+        result = from_log(given.target, **options, unit=given.unit or "s")
         if given.plot:
             plot(result, given.plot)
         if given.save:
@@ -64,27 +66,18 @@ def run(given: argparse.Namespace) -> None:
         print(json.dumps(result.json()) if given.json else _show_log(result, given.save))
         return
     _refuse(given, ("period", *COLUMNS, "unit", "warm_up", "plot", "save"), "a log", "an environment")
-    longest = given.longest or "200"
-    if not longest.isdecimal():
-        raise DelayRLError(f"--longest counts steps of an environment; got {longest!r}")
+    if isinstance(given.longest, float):
+        raise DelayRLError(f"--longest counts steps of an environment; got {given.longest:g} s")
+    longest = 200 if given.longest is None else given.longest
     episodes = 8 if given.episodes is None else given.episodes
     bar = partial(tqdm, desc="pushing", unit="episode", leave=False, disable=None)  # None: only on a terminal
     task = as_task(given.target, dict(given.env_kwargs), given.wrappers, given.flatten)
-    probed = probe(task, episodes, given.seed, int(longest), bar)
+    probed = probe(task, episodes, given.seed, longest, bar)
     print(json.dumps(probed.json()) if given.json else _show_environment(probed))
 
 
-def seconds(name: str, text: str | None) -> float | None:
-    """Return a time such as 20ms, 0.02, 0.02s or 50Hz in seconds; `name` is the option that it was given for."""
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)\s*(s|ms|us|ns|hz)?", text.strip().lower())
-    value = float(match[1]) if match else 0.0
-    if match and match[2] == "hz" and value > 0:
-        return 1 / value
-    if not match or match[2] == "hz":
-        raise DelayRLError(f"--{name.replace('_', '-')} is a time such as 20ms, 0.02s or 50Hz; got {text!r}")
-    return value * UNITS[match[2] or "s"]
+def _steps_or_seconds(text: str) -> int | float:
+    return int(text) if text.isdecimal() else seconds(text)
 
 
 def _show_environment(p: Probed) -> str:

@@ -88,14 +88,15 @@ def available(backend: str) -> bool:
 
 
 def table(rows: dict[str, list[dict[str, Any]]], period: float | None) -> tuple[list[str], list[list[str]]]:
-    """Return the head and cells of a table, from the rows of each backend and the control period in milliseconds."""
+    """Return the head and cells of a table, from the rows of each backend and the control period in seconds."""
     head = ["backend", "age", "p50 ms", "p99 ms", "max ms", "p99 of processor time"]
     head += ["p99 of the period"] if period else []
     cells = []
     for backend in BACKENDS:
         for row in rows.get(backend, []):
             times = [f"{row[name]:.3f}" for name in ("p50", "p99", "max", "processor_p99")]
-            cells.append([backend, str(row["age"]), *times] + ([f"{row['p99'] / period:.1%}"] if period else []))
+            times += [f"{row['p99'] / (1000 * period):.1%}"] if period else []
+            cells.append([backend, str(row["age"]), *times])
     return head, cells
 
 

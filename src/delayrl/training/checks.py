@@ -10,6 +10,7 @@ from delayrl.core.types import Spec
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import Setup
+from delayrl.training.machine import free_memory, uses_accelerator
 from delayrl.training.state import Ways
 from delayrl.training.tracking import SERVICES
 from delayrl.wrappers import Delayed
@@ -33,6 +34,15 @@ def replay_bytes(setup: Setup, spec: Spec) -> int:
     """Return the size of one seed's replay."""
     replay = jax.eval_shape(lambda: ring.init(spec, setup.schedule.replay_capacity // setup.entries(spec)))
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(replay))
+
+
+def check_memory(setup: Setup, spec: Spec, seeds: int, device: str | None) -> None:
+    """Raise DelayRLError for replays that the memory of this machine does not hold. An accelerator's is not known."""
+    needed, free = seeds * replay_bytes(setup, spec), free_memory()
+    if needed > free and not uses_accelerator(device):
+        whose = "the replay takes" if seeds == 1 else f"the replays of {seeds} seeds take"
+        line = f"{whose} {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free; give a smaller"
+        raise DelayRLError(f"{line} replay_capacity{'' if seeds == 1 else ', or fewer seeds at a time'}")
 
 
 def check_fit(setup: Setup, env: Delayed) -> State:

@@ -21,7 +21,10 @@ def free_memory() -> int:
     found = re.search(r"^MemAvailable:\s+(\d+) kB", about.read_text(), re.MULTILINE) if about.exists() else None
     free = int(found[1]) * 1024 if found else 2**62
     most, used = limit("memory.max"), limit("memory.current")
-    return min(free, int(most) - int(used)) if most.isdigit() and used.isdigit() else free
+    if not (most.isdigit() and used.isdigit()):
+        return free
+    cached = re.search(r"^inactive_file (\d+)$", limit("memory.stat"), re.MULTILINE)  # given back when memory is short
+    return min(free, int(most) - int(used) + (int(cached[1]) if cached else 0))
 
 
 def limit(name: str) -> str:

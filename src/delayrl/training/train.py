@@ -25,7 +25,7 @@ from delayrl.run.condition import Setup, resolve
 from delayrl.run.folder import RunFolder, RunLike, hold, path_of
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
-from delayrl.training.checks import check_fit, check_ways
+from delayrl.training.checks import check_fit, check_memory, check_ways
 from delayrl.training.learner import compiled
 from delayrl.training.loop import run
 from delayrl.training.machine import shared
@@ -125,6 +125,7 @@ def train_group(
     envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
     spec = spec_of(envs[0])
     shapes = check_fit(setup, envs[0])  # before anything is stored
+    check_memory(setup, spec, len(numbers), ways.device)
     keep_compiled()
     if ways.device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
@@ -145,7 +146,9 @@ def train_group(
             if ways.progress:
                 tqdm.write(line, file=sys.stderr)
 
-        if given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
+        if given is not None and not setup.delay.maximum:
+            note("delay: none")
+        elif given is not None and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         state = start(group, actors, overwrite, note)
         if state.step < setup.schedule.steps and (lines := shared(numbers, folders, ways.device)):
