@@ -51,6 +51,17 @@ def test_texts_of_no_task(text: str) -> None:
         as_task(text)
 
 
+def test_an_id_without_a_version_gets_the_newest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs and rows name it: in another release of Gymnasium the newest may be another task."""
+    named = {name: gym.registry["Pendulum-v1"] for name in ("Arm-v9", "Arm-v10", "Arm-view", "Arms-v11", "my/Arm-v12")}
+    monkeypatch.setattr(gym, "registry", named | {"Leg": gym.registry["Pendulum-v1"], "Leg-v0": None})
+    assert str(as_task("Arm(g=5) | flatten")) == "Arm-v10(g=5) | flatten"
+    assert str(as_task("my/Arm")) == "my/Arm-v12"
+    assert str(as_task("Leg")) == "Leg"
+    with pytest.raises(DelayRLError, match="unknown task 'Ar'"):
+        as_task("Ar").make()
+
+
 def test_the_order_of_arguments_does_not_matter() -> None:
     assert str(as_task("a:B(y=1)", {"x": 2})) == str(as_task("a:B", {"x": 2, "y": 1})) == "a:B(x=2, y=1)"
     assert str(as_task("a:B(x=1)", {"x": 2})) == "a:B(x=2)"
@@ -224,7 +235,7 @@ def test_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         (":Arm", "cannot import ''"),
         ("my_registered:My-v0", "task 'my_registered:My-v0' cannot be made here: OSError: no such robot"),
         ("My-v0", "task 'My-v0' cannot be made here: OSError: no such robot"),
-        ("My", "task 'My' cannot be made here: OSError: no such robot"),
+        ("My", "task 'My-v0' cannot be made here: OSError: no such robot"),
         ("builtins:dict", "must return a Gymnasium environment; got dict"),
         ("my_arm:Arm | my_arm:Broken(how=1)", "wrapper 'my_arm:Broken.*cannot be put around my_arm:Arm: TypeError"),
         ("my_arm:Arm | builtins:print", "builtins:print must return a Gymnasium environment; got NoneType"),

@@ -1,6 +1,7 @@
 """From the names of tasks and wrappers to the ids, classes and functions that they stand for."""
 
 import difflib
+import re
 import sys
 import sysconfig
 from pathlib import Path
@@ -12,14 +13,16 @@ from delayrl.errors import DelayRLError
 from delayrl.lookup import attribute, find_module, is_unsafe
 
 
-def is_registered(name: str) -> bool:
-    """Return whether Gymnasium knows an id, which may leave out its version."""
-    return name in gym.registry or any(known.rpartition("-v")[0] == name for known in gym.registry)
+def with_version(name: str) -> str:
+    """Return an id of Gymnasium's registry with its version, the newest if it has none; another name unchanged."""
+    pattern = re.compile(rf"{re.escape(name)}-v(\d+)")
+    versions = [int(match[1]) for known in gym.registry if (match := pattern.fullmatch(known))]
+    return name if name in gym.registry or not versions else f"{name}-v{max(versions)}"
 
 
 def find_id(name: str) -> str:
-    """Return an id of Gymnasium's registry unchanged. Raises DelayRLError, with the nearest ids, if it has none."""
-    if is_registered(name):
+    """Return an id of Gymnasium's registry unchanged. Raises DelayRLError, with the nearest ids, for another name."""
+    if name in gym.registry:
         return name
     near = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
     usual = "`delayrl tasks` lists tasks to choose from, and one of your own is MODULE:NAME"
@@ -41,8 +44,8 @@ def find_object(name: str) -> Any:
     refuse_instance(found)
     if callable(found):
         return found
-    if is_registered(path):
-        return path
+    if with_version(path) in gym.registry:
+        return with_version(path)
     known = [name for name, value in vars(module).items() if callable(value)]
     near = difflib.get_close_matches(path, [*known, *gym.registry], n=3, cutoff=0.5)
     hint = f"; did you mean {', '.join(near)}?" if near else ""

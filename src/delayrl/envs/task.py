@@ -7,9 +7,9 @@ a run, a row of results and a grid need no other field for it:
     Pendulum-v1(g=5.0)
     arm:Arm(gain=2, model="arm.xml") | gymnasium.wrappers:TimeLimit(max_episode_steps=200) | flatten
 
-The first part is an id of Gymnasium's registry, `module:id`, or `module:object` for a class or function. Each part
-behind a bar names a wrapper as `module:object`; `flatten` joins nested observations to one vector. Values are JSON.
-What cannot be imported by a name, such as a lambda, is written `<lambda>`.
+The first part is an id of Gymnasium's registry, `module:id`, or `module:object` for a class or function. An id without
+a version gets the newest. Each part behind a bar names a wrapper as `module:object`; `flatten` joins nested
+observations to one vector. Values are JSON. What cannot be imported by a name, such as a lambda, is written `<lambda>`.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation
 
-from delayrl.envs.lookup import find_id, find_object, find_stored, refuse_instance
+from delayrl.envs.lookup import find_id, find_object, find_stored, refuse_instance, with_version
 from delayrl.errors import DelayRLError
 from delayrl.lookup import name_of_object, one_line, parse_arguments, with_arguments
 
@@ -127,7 +127,7 @@ def as_task(
             hold, a wrapper without a name.
     """
     task = env if isinstance(env, Task) else _parse(env) if isinstance(env, str) else Task(_named(env))
-    first = replace(task.env, kwargs={**task.env.kwargs, **_plain(kwargs or {})})
+    first = replace(task.env, name=with_version(task.env.name), kwargs={**task.env.kwargs, **_plain(kwargs or {})})
     around = list(task.wrappers)
     for wrapper in [wrappers] if isinstance(wrappers, str) or callable(wrappers) else wrappers:
         more = _parse(wrapper) if isinstance(wrapper, str) else Task(_named(wrapper))
