@@ -156,6 +156,10 @@ def test_code_that_came_with_a_run_is_not_imported(tmp_path: Path, monkeypatch) 
     for text in (f'os:mkdir(path="{witness}")', f'pathlib:Path.touch(self="{witness}")'):
         with pytest.raises(DelayRLError, match="came with a law of delays that could run any code"):
             stored_delay(text, folder)
+    (tmp_path / "secret.txt").write_text("hunter2")
+    with pytest.raises(DelayRLError, match=r"unknown delay 'recorded:secret.txt'"):
+        stored_delay("recorded:secret.txt", folder)  # a folder from elsewhere names no file
+    assert stored_delay("recorded:1,2,", folder) == as_delay("recorded:1,2,")
     assert not witness.exists()
     assert delayrl.make(make_arm, "runs.evil:Burst").delay.maximum == 3  # whoever names it means it
     assert witness.exists()

@@ -74,6 +74,8 @@ def test_a_function_of_the_three() -> None:
     controller.observe([0.25, 0, 0], 0)
     assert [float(controller.act()[0]) for _ in range(3)] == [0.25, 1.5, 2.0]  # 0.25, + 0.25 + 1, clipped
     assert (controller.policy.dt, controller.policy.max_age) == (0.05, 2)
+    other = Delayed(gym.make("Pendulum-v1"), "200ms", step_seconds=0.1)
+    assert (adapt(np.sin, other).dt, adapt(np.sin, other).max_age) == (0.1, 2)
 
 
 @pytest.mark.parametrize(

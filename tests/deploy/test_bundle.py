@@ -182,6 +182,10 @@ def test_a_small_file_cannot_ask_for_much_memory(max_age: int, action_size: int)
     parse(document(9_000))
     with pytest.raises(DelayRLError, match="history too large"):
         parse(document(max_age))
+    attending = {"input": "transformer", "width": 1, "blocks": 1, "current": [2]}  # one number for each pair of ages
+    parse(document(3_000) | attending)
+    with pytest.raises(DelayRLError, match="too large for a transformer: 4,000 steps"):
+        parse(document(4_000) | attending)
 
 
 @pytest.mark.parametrize(

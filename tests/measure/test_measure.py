@@ -15,8 +15,8 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import DelayObservation, StickyAction
 
 from delayrl import DelayRLError
+from delayrl.cli.console import seconds
 from delayrl.cli.main import main
-from delayrl.cli.measure import seconds
 from delayrl.envs import quiet
 from delayrl.measure import from_log, probe
 from delayrl.measure.log import rounded_up_steps
@@ -435,8 +435,8 @@ def test_period_and_rounding(tmp_path: Path) -> None:
         for period in (0.02, 0.001, 1 / 30, 7.3):
             assert rounded_up_steps(steps * period, period) == steps
             assert rounded_up_steps((steps + 0.01) * period, period) == steps + 1
-    times = {"20ms": 0.02, "0.02": 0.02, "50Hz": 0.02, "2e-2s": 0.02, "15 s": 15.0, "500us": 5e-4}
-    assert {text: seconds("period", text) for text in times} == pytest.approx(times)
+    times = {"20ms": 0.02, "0.02s": 0.02, "50Hz": 0.02, "2e-2s": 0.02, "15 s": 15.0, "500us": 5e-4}
+    assert {text: seconds(text) for text in times} == pytest.approx(times)
 
 
 def test_stamps_are_exact(tmp_path: Path) -> None:
@@ -456,6 +456,30 @@ def test_stamps_are_exact(tmp_path: Path) -> None:
     assert recommended == ["uniform:3:6", "uniform:1:2", "1"]  # made up to 100 + 20 ms ago, rounded
     columns["received"] = made + 0.05 + 1e-3 * (made - made[0])  # a clock that gains 1 ms a second
     assert from_log(write(tmp_path / "log.csv", columns)).drift == pytest.approx(1000, rel=0.01)
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_sensor_slower_than_the_loop(every: int, tmp_path: Path) -> None:
+    """Each row of the loop shows the newest observation: one that stands in several rows counts once."""
+    made = ROW * every * np.arange(300)
+    columns = {"stamp": made, "received": made + 0.05}
+    rows = [row for row in range(300) for _ in range(every)]
+    once = from_log(write(tmp_path / "once.csv", columns))
+    often = from_log(write(tmp_path / "often.csv", columns, rows))
+    assert (often.row, often.rows, often.steps) == (once.row, once.rows, once.steps)
+    loop = from_log(tmp_path / "often.csv", ROW)
+    assert loop.train_with == f"episode:2:{2 + every}"  # 50 ms, and up to a period of the sensor more
+    loop.save(str(tmp_path / "steps.txt"))
+    assert (tmp_path / "steps.txt").read_text().split() == ["3"] * loop.rows
+
+
+def test_half_of_the_stamps(tmp_path: Path) -> None:
+    """Who names a column of stamps is not given a correlation instead."""
+    path = write(tmp_path / "log.csv", {"time": TIME, "made": TIME, "command": COMMAND, "obs": OBS})
+    with pytest.raises(DelayRLError, match="no column for --received, when observations arrived"):
+        from_log(path, stamp="made")
+    with pytest.raises(DelayRLError, match="no column for --stamp, when observations were made"):
+        from_log(path, received="made")
 
 
 def test_simulated_robot(tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import RescaleAction
 
 import delayrl
 from delayrl.agents.registry import AGENTS
@@ -13,6 +15,7 @@ from delayrl.envs import make
 from delayrl.play.evaluation import TRAINING, reset_seed
 from delayrl.training.actor import Actor
 from delayrl.training.loop import hidden_steps
+from delayrl.wrappers import Delayed
 from short_runs import newest, train
 
 
@@ -37,6 +40,23 @@ def test_nan_from_the_environment(what: str, tmp_path: Path, monkeypatch) -> Non
     monkeypatch.setattr(ReacherEnv, "step", step)
     assert newest(tmp_path / "run").step >= 100
     assert newest(train("bpql", tmp_path / "run")).step == 300
+
+
+def test_an_environment_that_writes_into_its_own_array() -> None:
+    """The replay gets the state before the step and the one after it, not the same array twice."""
+
+    class Reusing(gym.ObservationWrapper):
+        array = np.zeros(10, np.float32)
+
+        def observation(self, observation: np.ndarray) -> np.ndarray:
+            self.array[:] = [*observation[:9], self.unwrapped.data.time]
+            return self.array
+
+    task = Delayed(RescaleAction(Reusing(gym.make("Reacher-v5")), np.float32(-1), np.float32(1)), 3)
+    actor = Actor(task, 7, privileged=False)
+    steps = [actor.step(np.zeros(2, np.float32)) for _ in range(50)]
+    times = np.array([(step.obs[-1], step.next_obs[-1]) for step in steps])
+    np.testing.assert_allclose(times, 0.02 * np.stack([np.arange(50), np.arange(1, 51)], 1), rtol=1e-5)
 
 
 def test_actions_beyond_their_range() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import DelayObservation
+from gymnasium.wrappers import DelayObservation, RecordEpisodeStatistics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -358,11 +358,12 @@ def test_the_info_of_the_last_step_is_not_repeated() -> None:
 
 
 @pytest.mark.parametrize("delay", [0, 2])
-def test_arrays_belong_to_whoever_holds_them(delay: int) -> None:
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_arrays_belong_to_whoever_holds_them(dtype: type, delay: int) -> None:
     """Neither an environment that reuses its arrays nor an agent that writes into its own changes what is shown."""
 
     class Reusing(Journal):
-        array = np.zeros(2)
+        array = np.zeros(2, dtype)
 
         def reset(self, **options: Any):
             self.array[:] = super().reset(**options)[0]
@@ -374,12 +375,15 @@ def test_arrays_belong_to_whoever_holds_them(delay: int) -> None:
             return self.array, *rest
 
     env = Delayed(Reusing(20), delay)
-    obs, _ = env.reset(seed=0)
+    obs, info = env.reset(seed=0)
+    truths = [info["truth"]]
     for t in range(1, 9):
         obs[:] = 99
         obs, *_, info = env.step(np.float32([0.5]))
         assert obs[0] == max(t - delay, 0)
         info["actions"][:] = 99
+        truths.append(info["truth"])
+    assert [truth[0] for truth in truths] == [*range(9)]
 
 
 @pytest.mark.parametrize("fill", ["first", "zeros"])
@@ -451,10 +455,25 @@ def test_actions_without_a_zero() -> None:
     assert env.observation_space.contains(x.astype(env.observation_space.dtype))
     env.step(np.float32([3]))
     assert env.unwrapped.acted == [1.0]  # type: ignore[attr-defined]
+    for wrong in ([np.nan], [0.5, 0.5]):
+        with pytest.raises(delayrl.DelayRLError, match=r"idle action must be finite and have the shape \(1,\)"):
+            Delayed(Gas(20), "1+action=2", idle=np.array(wrong))
 
 
 def test_the_length_of_a_step_may_be_called_tau() -> None:
     assert Delayed(Gas(20), "40ms").delay == as_delay(2)
+
+
+def test_a_wrapper_that_repeats_actions_says_how_long_its_step_is() -> None:
+    class Repeating(gym.Wrapper):
+        dt = 0.08
+        tau = 0.5  # of a filter
+
+    env = Delayed(AugmentedObservation(Delayed(Repeating(Gas(20)), 0)).env.env, "160ms")
+    assert (env.delay, env.step_seconds) == (as_delay(2), 0.08)
+    assert Delayed(Repeating(Gas(20)), "160ms", step_seconds=0.04).delay == as_delay(4)
+    del Repeating.dt
+    assert Delayed(Repeating(Gas(20)), "160ms").delay == as_delay(8)
 
 
 def test_idle_is_zero_in_the_tasks_units() -> None:
@@ -477,6 +496,43 @@ def test_one_delay_is_enough() -> None:
         Delayed(AugmentedObservation(Delayed(Journal(5), 1)), 2)
     with pytest.raises(delayrl.DelayRLError, match="takes a vector"):
         DelayedVector(Journal(5), 2)  # type: ignore[arg-type]
+    late, rewarded = (vectors(lambda d=d: Delayed(Journal(5), d)) for d in ("2", "reward=1"))
+    with pytest.raises(delayrl.DelayRLError, match="delayed already"):
+        DelayedVector(late, 2)
+    assert DelayedVector(rewarded, 2).delay == as_delay(2)
+
+
+def vectors(make: Any, **options: Any) -> Any:
+    """Two environments in a vector."""
+    from gymnasium.vector import SyncVectorEnv
+
+    return SyncVectorEnv([make] * 2, **options)
+
+
+class Numeric(gym.vector.VectorWrapper):
+    """Gives the last observations as one array of numbers, as vectors on accelerators do."""
+
+    def step(self, actions: Any) -> Any:
+        *outcome, infos = self.env.step(actions)
+        if "final_obs" in infos:
+            infos["final_obs"] = np.array([np.zeros(2) if x is None else x for x in infos["final_obs"]])
+            del infos["_final_obs"]
+        return *outcome, infos
+
+
+@pytest.mark.parametrize("numeric", [False, True])
+def test_what_else_stands_in_the_info_of_an_end(numeric: bool) -> None:
+    """Statistics of the episode, whose entries are dicts; and last observations in an array of numbers."""
+    from gymnasium.vector import AutoresetMode
+
+    made = vectors(lambda: RecordEpisodeStatistics(Journal(4)), autoreset_mode=AutoresetMode.SAME_STEP)
+    env = AugmentedVectorObservation(DelayedVector(Numeric(made) if numeric else made, 2))
+    env.reset(seed=0)
+    for step in range(1, 5):
+        *_, infos = env.step(np.full((2, 1), 0.1 * step, np.float32))
+    assert set(infos["final_info"]) >= {"episode", "age", "actions"}
+    for last in infos["final_obs"]:
+        np.testing.assert_allclose(last, [2, 0.2, 0.3, 0.4, 1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("delay", [2, "uniform:1:3@fifo+action=1", as_delay("walk:3")])

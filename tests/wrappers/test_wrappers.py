@@ -161,4 +161,5 @@ def test_an_episode_in_which_nothing_is_observed(monkeypatch) -> None:
     with pytest.warns(DelayWarning, match="nothing after the start"):
         delayrl.make("Reacher-v5", 49)
     delayrl.make("Reacher-v5", 48)
+    delayrl.make("Reacher-v5", "1+action=48")
     delayrl.make("Reacher-v5", "uniform:1:50")

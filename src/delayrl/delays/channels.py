@@ -291,10 +291,9 @@ class DelayParser:
             case "gilbert":
                 readers = self.steps, self.steps, self.probability, self.probability
                 return laws.gilbert_elliott(*self.values(rest, *readers))
-            case "walk" if ":" in rest:
-                return laws.random_walk(*self.values(rest, self.steps, self.probability))
             case "walk":
-                return laws.random_walk(self.steps(rest))
+                both = self.steps, self.probability
+                return laws.random_walk(*self.values(rest, *(both if ":" in rest else both[:1])))
             case "markov":
                 states, table = self.values(rest, str, str)
                 rows = tuple(tuple(map(self.probability, row.split(","))) for row in table.split("/"))
@@ -303,7 +302,7 @@ class DelayParser:
                 return PerEpisode(self.law(f"uniform:{rest}" if re.match(r"[^:a-z]+(s|ms)?:", rest) else rest))
             case "recorded" if re.fullmatch(r"(\d{1,9},)+(\d{1,9})?", rest):
                 return laws.Recorded(tuple(int(word) for word in rest.split(",") if word))
-            case "recorded":
+            case "recorded" if self._folder is None:  # a run folder holds the numbers, and may come from elsewhere
                 path, _, unit = rest.rpartition(":")
                 return recorded(path, self.step_seconds, unit) if path and unit in ("s", "ms") else recorded(rest)
         raise DelayRLError(f"unknown delay {part!r} ({FORMS})")

@@ -20,7 +20,7 @@ from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import described, pack
 from delayrl.errors import DelayRLError
 from delayrl.wrappers import AugmentedObservation, Delayed
-from delayrl.wrappers.single import find_delayed, name_of, seconds_of
+from delayrl.wrappers.single import find_delayed, name_of
 
 SAMPLES, TOLERANCE = 200, 1e-4
 """Inputs on which layers are compared with the policy that they are of, and their largest error, of the range."""
@@ -72,7 +72,7 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         actions.low,
         actions.high,
         history,
-        seconds_of(env),
+        delayed.step_seconds,
         delay.action.maximum,
     )
 

@@ -97,9 +97,9 @@ class Estimated:
         """How many windows or observations had each number of steps."""
         return dict(sorted(Counter(self.steps).items()))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the steps, one a line, for `--delay recorded:FILE`."""
-        path.write_text("".join(f"{step}\n" for step in self.steps or (self.step,)))
+        Path(path).write_text("".join(f"{step}\n" for step in self.steps or (self.step,)))
 
     def json(self) -> dict[str, Any]:
         """Return a dict for `json.dumps`."""
@@ -162,18 +162,19 @@ def from_log(
 
 
 def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, warm_up: float | None) -> Estimated:
-    if len(made) < 10:
-        raise DelayRLError(f"{path} has {len(made)} rows: too short, at least 10 are needed")
-    delays, start = arrived - made, made - made[0]
+    delays = arrived - made
     if (np.diff(made) < 0).any():
         row = int(np.argmax(np.diff(made) < 0)) + 2
         raise DelayRLError(f"{path}, row {row}: the stamp goes back; sort the rows by when observations were made")
-    if (np.diff(made) == 0).all():
-        raise DelayRLError(f"{path}: every observation has the same stamp")
     if delays.min() < 0:
         row = int(np.argmin(delays))
         hint = "the clocks differ by at least that; synchronise them (PTP, NTP), or stamp both ends with one clock"
         raise DelayRLError(f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made: {hint}")
+    first = np.diff(made, prepend=-np.inf) > 0  # a row of the control loop may show the observation of the row before
+    made, delays = made[first], delays[first]
+    if len(made) < 10:
+        raise DelayRLError(f"{path} has {len(made)} different stamps: too short, at least 10 are needed")
+    start = made - made[0]
     row_spacing = float(np.median(np.diff(made)))
     warm = WARM_UP * float(start[-1]) if warm_up is None else warm_up
     used = start >= warm
@@ -280,7 +281,7 @@ def _pairs(
     return tuple(pair for pair, _ in pairs), pairs[0][1]
 
 
-def plot(estimated: Estimated, out: Path) -> None:
+def plot(estimated: Estimated, out: str | Path) -> None:
     """Plot how far each lag is from chance, or with stamps how often each delay occurs.
 
     The suffix of `out` sets the format. Raises DelayRLError if matplotlib does not know it.
@@ -291,7 +292,7 @@ def plot(estimated: Estimated, out: Path) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
-    if out.suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
+    if Path(out).suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
         pyplot.close(figure)
         raise DelayRLError(f"--plot takes a .png, .svg or .pdf file; got {out}")
     if estimated.method == "stamps":

@@ -77,6 +77,9 @@ def read_stamps(path: Path, stamp: str | None, received: str | None, unit: str) 
     made = table.find(stamp, ("stamp",), "send times", "--stamp")
     arrived = table.find(received, ("received",), "arrival times", "--received")
     if not made or not arrived:
+        if stamp or received:
+            other = "--received, when observations arrived" if made else "--stamp, when observations were made"
+            raise DelayRLError(f"{path}: stamps need both times; it has no column for {other}")
         return None
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit]
 

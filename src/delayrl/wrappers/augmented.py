@@ -116,7 +116,11 @@ class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Info]:
         """Issue an action in every environment."""
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
-        for i in np.flatnonzero(infos.get("_final_obs", [])):
-            last = {name: infos["final_info"][name][i] for name in infos["final_info"] if not name.startswith("_")}
-            infos["final_obs"][i] = self._augment(infos["final_obs"][i], last)
+        last = infos.get("final_info", {})
+        if ended := list(np.flatnonzero(last.get("_age", []))):
+            final_obs = np.full(self.num_envs, None, object)
+            for i in ended:
+                own = {name: last[name][i] for name in ("age", "actions", "applied") if name in last}
+                final_obs[i] = self._augment(infos["final_obs"][i], own)
+            infos["final_obs"] = final_obs
         return self._augment(obs, infos), rewards, terminated, truncated, infos

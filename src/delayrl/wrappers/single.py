@@ -37,9 +37,11 @@ def name_of(env: Any) -> str:
 
 
 def seconds_of(env: Any) -> float | None:
-    """Return the length of a step in seconds, which a task gives as `dt` or `tau`; None if it does not."""
-    for name in ("dt", "tau"):
-        seconds = getattr(env.unwrapped, name, None)
+    """Return the length of a step in seconds: the `dt` of the outermost layer that has one, or the task's `tau`."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    for seconds in [*(getattr(layer, "dt", None) for layer in layers), getattr(layers[-1], "tau", None)]:
         if isinstance(seconds, int | float | np.number) and seconds > 0:
             return float(seconds)
     return None
@@ -83,8 +85,9 @@ def history_rows(env: Any, delay: Delay, history: int | None) -> int:
     """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
     name, limit = name_of(env), limit_of(env)
     check_length(delay, name, limit)
-    if limit is not None and delay.observation.constant and delay.maximum >= limit - 1:
-        line = f"with a delay of {delay.maximum} steps nothing after the start of an episode of {name} "
+    late = delay.observation.maximum
+    if limit is not None and delay.observation.constant and late >= limit - 1:
+        line = f"with a delay of {late} steps nothing after the start of an episode of {name} "
         line += f"({limit} steps) is ever observed: the agent acts on s_0 and its own actions alone"
         if line not in _warned:
             _warned.add(line)
@@ -101,8 +104,8 @@ def make_transit(delay: Delay, history: int, fill: Fill, actions: Box, idle: Any
     if fill not in get_args(Fill):
         raise DelayRLError(f"fill must be {' or '.join(get_args(Fill))}; got {fill!r}")
     idle = np.zeros(actions.shape) if idle is None else np.asarray(idle)
-    if idle.shape != actions.shape:
-        raise DelayRLError(f"the idle action must have the shape {actions.shape}; got {idle.shape}")
+    if idle.shape != actions.shape or not np.isfinite(idle).all():
+        raise DelayRLError(f"the idle action must be finite and have the shape {actions.shape}; got {idle}")
     return Transit(delay, history, fill, np.clip(idle.astype(actions.dtype), actions.low, actions.high))
 
 
@@ -129,7 +132,8 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         history: rows of the action history, to train for longer ages than this delay has; None for the longest age.
         fill: what is shown before anything has arrived: "first" (s_0, at once) or "zeros".
         idle: the action in force before the first one has arrived, [A]; None for zero. Clipped to the bounds.
-        step_seconds: the length of a step, for delays given as times; None for what the task says (`dt` or `tau`).
+        step_seconds: the length of a step, for delays given as times; None for what the task says (`dt` or `tau`). A
+            wrapper that repeats actions says it with a `dt` of its own.
 
     Raises:
         DelayRLError: a bad delay, or an environment whose spaces are not flat boxes.
@@ -148,8 +152,11 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
             raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
-        self.delay = as_delay(delay, seconds_of(env) if step_seconds is None else step_seconds)
-        RecordConstructorArgs.__init__(self, delay=self.delay.plain(), history=history, fill=fill, idle=idle)
+        self.step_seconds = seconds_of(env) if step_seconds is None else step_seconds
+        self.delay = as_delay(delay, self.step_seconds)
+        RecordConstructorArgs.__init__(
+            self, delay=self.delay.plain(), history=history, fill=fill, idle=idle, step_seconds=step_seconds
+        )
         gym.Wrapper.__init__(self, env)
         self.history = history_rows(env, self.delay, history)
         self._transit = make_transit(self.delay, self.history, fill, env.action_space, idle)
@@ -196,7 +203,8 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         else:
             actions = np.zeros((self.history, recent.shape[1]), recent.dtype)
             actions[:age] = recent
-        info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy(), "truth": self._truth}
+        info = {**self._info, "age": age, "actions": actions, "mask": self._masks[age].copy()}
+        info["truth"] = np.array(self._truth)  # the environment may go on to write into its own
         if self.delay.action.maximum:
             info["observation_age"], info["applied"] = age - self._transit.lag, applied
         return obs.copy(), info

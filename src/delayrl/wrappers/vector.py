@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from delayrl.delays import DelayLike, as_delay
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Info, check_spaces, history_rows, make_transit, name_of, seconds_of
+from delayrl.wrappers.single import Info, check_spaces, find_delayed, history_rows, make_transit, name_of, seconds_of
 from delayrl.wrappers.transit import Fill, Transit
 
 
@@ -26,6 +26,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         delay: as `Delayed`.
         history: as `Delayed`.
         fill: as `Delayed`.
+        idle: as `Delayed`.
         step_seconds: the length of a step, for delays given as times; None to ask the environments.
 
     Raises:
@@ -39,6 +40,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         delay: DelayLike,
         history: int | None = None,
         fill: Fill = "first",
+        idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
         if not isinstance(env, VectorEnv):
@@ -46,7 +48,10 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         check_spaces(name_of(env), env.single_observation_space, env.single_action_space)
         actions: Any = env.single_action_space
         super().__init__(env)
-        if step_seconds is None and (envs := getattr(env.unwrapped, "envs", None)):
+        envs = getattr(env.unwrapped, "envs", ())
+        if any(inner.delay.maximum for inner in map(find_delayed, envs) if inner):
+            raise DelayRLError("the environments are delayed already: give one delay, e.g. '2+action=1'")
+        if step_seconds is None and envs:
             step_seconds = seconds_of(envs[0])
         self.delay = as_delay(delay, step_seconds)
         if self.delay.reward.maximum:
@@ -55,7 +60,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
                 "delay them inside, gymnasium.make_vec(..., wrappers=[lambda env: Delayed(env, ...)])"
             )
         self.history = history_rows(env, self.delay, history)
-        self._transits = [make_transit(self.delay, self.history, fill, actions) for _ in range(env.num_envs)]
+        self._transits = [make_transit(self.delay, self.history, fill, actions, idle) for _ in range(env.num_envs)]
         mode = env.metadata.get("autoreset_mode")
         self._mode = getattr(mode, "value", mode or "NextStep")
         self._masks, self._dtype = np.tri(self.history + 1, self.history, -1, bool), actions.dtype

@@ -131,6 +131,8 @@ def parse(document: Any) -> Network:
     kind = document.get("input")
     if kind not in INPUTS or (sizes["max_age"] == 0 and kind != "observation"):
         raise DelayRLError(f"its policy's input must be one of {', '.join(INPUTS)}; all but the first need an age")
+    if kind == "transformer" and sizes["max_age"] ** 2 > LARGEST_HISTORY:
+        raise DelayRLError(f"its policy's max_age is too large for a transformer: {sizes['max_age']:,} steps")
     if kind == "transformer" and document.get("current") is None:
         raise DelayRLError("its policy's input is transformer, which has no output at age 0: it needs a current")
     hidden = widths("hidden")
