@@ -119,8 +119,8 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
     """
     arms, slower = {name(r): r for r in results}, slower or {}
     base, whole = arms.get(BASE), arms.get(WHOLE)
-    head = ["arm", "seeds", "over training", "times BPQL's", "less BPQL's"]
-    head += ["`any-age`'s less it, by seed", "at the end", f"above {AWAY:,}", "GFLOP", "update over BPQL's"]
+    head = ["arm", "seeds", "over training", "times BPQL's", "minus BPQL's"]
+    head += ["`any-age` minus this arm, by seed", "at the end", f"above {AWAY:,}", "GFLOP", "update time / BPQL's"]
     body = []
     for result in results:
         own, final, other = area(result), result.curves.final, area(base) if base and base is not result else None

@@ -23,7 +23,8 @@ State = Any
 class Phase(NamedTuple):
     """A schedule of gradient updates: `updates` of them every `every` environment steps.
 
-    Each `update(state, windows, key, count)` is pure and gets a fresh batch of `batch` windows; `count` starts at 0.
+    Each `update(state, windows, key, count)` is pure and gets a fresh batch of `batch` windows. `count` numbers the
+    updates as if they had begun at step 0, so that of the first one is not 0; `step_of` gives its environment step.
     """
 
     every: int
