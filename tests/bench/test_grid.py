@@ -218,6 +218,8 @@ BAD = [
     (BASIC.replace("[2, 3]", "3"), "delays must be a list"),
     (BASIC.replace('"bpql"', '"sac"'), "delay-free reference"),
     (BASIC + "[overrides]\nbatch_sise = 3\n", "did you mean batch_size"),
+    (BASIC + "[overrides.dcac]\nhidden = [8]\n", "overrides of dcac, which is not among the agents bpql, a-sac"),
+    (BASIC + "[[product]]\n[product.overrides.vdpo]\nwidth = 8\n", "product 1: there are overrides of vdpo, which is"),
     (BASIC + "[overrides]\nwidth = 3\n", "unknown hyperparameter 'width'"),
     (BASIC + "[[product]]\n[product.overrides]\nwidth = 3\n", "product 1: unknown hyperparameter 'width'"),
     (BASIC + "[overrides]\nsteps = 900\n", "nothing would be learned: the first update is at step 1,000"),

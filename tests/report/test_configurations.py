@@ -2,9 +2,11 @@
 
 import json
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from delayrl.errors import DelayRLError
@@ -22,10 +24,10 @@ COST = Cost(12_345, {"actor": 0.5, "critic": 1.0, "temperature": 0.5}, (128,), 3
 
 def made(
     folder: Path, value: float, seed: int = 0, agent: str = "bpql", env: str = "Pendulum-v1", delay: int = 3,
-    older: bool = False, until: int = 10**9, **values: Any,
+    older: bool = False, until: int = 10**9, origin: dict[str, Any] | None = None, **values: Any,
 ) -> Path:  # fmt: skip
     """A run folder whose evaluations are all `value`, one every 100 steps; its rows."""
-    setup = resolve(agent, env, delay, "small", "corrected", {"steps": 300} | values)
+    setup = replace(resolve(agent, env, delay, "small", "corrected", {"steps": 300} | values), origin=origin or {})
     names: dict[str, Any] = {} if older else {"configuration": setup.configuration}
     run = RunFolder(folder)
     run.create(setup.config | names | {"seed": seed, "cost": COST.json})
@@ -59,6 +61,22 @@ def test_runs_that_differ_in_an_option_are_two_results(tmp_path: Path) -> None:
     summary = summary_of(*one, *other)
     assert [table.title for table in summary.tables if table.kind == "ablation"] == ["Ablation of bpql"]
     assert summary.shared == {("bpql", ""): {"steps": 300}}
+
+
+def test_runs_that_began_otherwise_say_so_and_are_no_reference(tmp_path: Path) -> None:
+    """A delay-free SAC that began with another's networks has trained for longer than its steps."""
+    begun = {"from": {"agent": "sac", "step": 900}}
+    rows = [
+        made(tmp_path / "random", 0.0, agent="random", delay=0),
+        made(tmp_path / "bpql", 50.0, origin={"lengths": [100, 200]}),
+        made(tmp_path / "begun", 1000.0, agent="sac", delay=0, origin=begun),
+    ]
+    (bpql,) = (r for place, r in summary_of(*rows).results.items() if place.label == "bpql")
+    assert np.isnan(bpql.final).all()
+    rows += [made(tmp_path / "sac", 100.0, agent="sac", delay=0), made(tmp_path / "new", 40.0)]
+    results = {place.label: r for place, r in summary_of(*rows).results.items()}
+    assert set(results) == {"random", "sac", "sac from=sac@900", "bpql", "bpql went_on=100, 200"}
+    assert {r.reference_anchor.value for r in results.values()} == {100.0}
 
 
 def test_a_shorter_run_is_not_dropped(tmp_path: Path) -> None:

@@ -60,6 +60,8 @@ def test_without_anchors_there_are_raw_returns_and_nothing_else() -> None:
         assert math.isnan(entry.area)
         assert np.isnan(entry.interval).all()
         assert not summary.aggregates
+        result = of(summary, "vdpo")
+        assert np.isnan([result.threshold, result.steps_to_threshold, *result.steps_interval]).all()
 
 
 def test_a_reference_inside_another_agent_is_no_anchor() -> None:
@@ -118,6 +120,32 @@ def test_a_reference_that_is_worse_than_random_normalises_nothing() -> None:
     curves = anchored(cells, sac=[[0.0, 0, 5], [0.0, 0, 5]], vdpo=[[0.0, 0, 50], [0.0, 0, 50]])
     result = of(summarise(curves, [*cells.values()]), "vdpo")
     assert np.isnan(result.normalise(result.curves.final)).all()
+    assert np.isnan([result.threshold, result.steps_to_threshold, *result.steps_interval]).all()
+
+
+def test_the_random_policy_with_the_most_seeds_is_the_anchor() -> None:
+    """It does not learn, so one of any preset will do; one seed of it has no interval."""
+    cells = small() | {"lone": standing("random", "delayrl/Ant-v4", 0, 1, id="a", steps=300, preset="matched")}
+    every = anchored(cells, vdpo=[[0.0, 0, 60], [0.0, 0, 60]], lone=[[50.0] * 3])
+    result = of(summarise(every, [*cells.values()]), "vdpo")
+    assert result.random_anchor.value == 10
+    assert np.isfinite(result.final_interval).all()
+
+
+def test_runs_of_other_lengths_are_not_beside_each_other_over_all_tasks() -> None:
+    """Each is normalised by delay-free SAC of its own length. The table says how long each was."""
+    given: dict[str, Any] = {"seeds": 2, "steps": 200}
+    shorter = {
+        "bpql": standing("bpql", "delayrl/Ant-v4", 5, **given),
+        "sac2": standing("sac", "delayrl/Ant-v4", 0, id="shorter", **given),
+    }
+    cells = small() | shorter
+    curves = {"vdpo": [[0.0, 0, 60]] * 2, "bpql": [[0.0, 60]] * 2, "sac2": [[0.0, 60], [0.0, 70]]}
+    summary = summarise(anchored(cells, **curves), [*cells.values()])
+    assert not summary.aggregates
+    entries = summary.tables[0].entries
+    notes = {label: entry.note for (_, _, label), entry in entries.items() if entry.note}
+    assert notes == {"vdpo": "300 steps", "bpql": "200 steps"}
 
 
 def test_a_run_that_goes_on_is_not_compared_as_if_it_had_ended() -> None:

@@ -1,17 +1,26 @@
 """Runs that go on after their end, and runs that begin with the networks of others."""
 
+import os
 import shutil
+import signal
+import threading
+from importlib import import_module
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 import delayrl
+import own_tasks
 from conftest import quick
 from delayrl.cli.main import main
+from delayrl.errors import StoppedError
 from delayrl.play.run import Run
 from delayrl.training.resume import fitting, part_of
 from short_runs import arrays, newest, train
+
+module = import_module("delayrl.training.train")  # `delayrl.training` may show its function under that name
 
 
 def without_hash(run: Run) -> list[dict]:
@@ -104,7 +113,8 @@ def files(folder: Path) -> dict[Path, bytes]:
         ({"track": "mlflow"}, "tensorboard or wandb; got 'mlflow'"),
         ({"callback": 3}, "callback is a function of the step and the runs; got 3"),
         ({"device": "cuda"}, "device must be cpu or gpu"),
-        ({"env": "Swimmer-v5"}, "was trained on a task of other sizes than Swimmer-v5"),
+        ({"env": "Swimmer-v5"}, "a run goes on in its own task, Reacher-v5; got Swimmer-v5"),
+        ({"env": "Reacher-v5(reward_dist_weight=9)"}, r"in its own task, Reacher-v5; got Reacher-v5\(reward_dist"),
     ],
 )
 def test_what_is_refused_changes_no_run(wrong: dict, line: str, tmp_path: Path) -> None:
@@ -117,6 +127,41 @@ def test_what_is_refused_changes_no_run(wrong: dict, line: str, tmp_path: Path) 
         with pytest.raises(delayrl.DelayRLError, match=line):
             train("random", run.path, steps=200, overwrite=True, **wrong)
         assert files(run.path) == before
+
+
+def test_rows_go_on_to_name_the_task_that_the_run_began_with(tmp_path: Path) -> None:
+    """One run is one result, also where its task has no name by which it could be found again."""
+    nameless = lambda: own_tasks.make_arm()  # noqa: E731
+    run = train("random", tmp_path / "run", steps=200, env=nameless, wrappers=own_tasks.LIMIT)
+    delayrl.go_on(run, 300, env=own_tasks.make_arm, progress=False)
+    assert [row["step"] for row in run.rows()][::2] == [100, 200, 300]
+    assert {row["env"] for row in run.rows()} == {run.config["env"]}
+    assert run.config["env"].startswith("<")
+    with pytest.raises(delayrl.DelayRLError, match="belongs to another agent or configuration: action_size"):
+        delayrl.go_on(run, 400, env=lambda: gym.make("Reacher-v5"), progress=False)
+
+
+def test_a_finished_run_gives_up_its_replay_when_asked_to(tmp_path: Path) -> None:
+    run = train("random", tmp_path / "run", steps=200)
+    assert (run.path / "replay").exists()
+    train("random", run.path, steps=200, slim=True)
+    assert not (run.path / "replay").exists()
+
+
+def test_a_signal_before_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the run is prepared or a replay is read."""
+    assert threading.current_thread() is threading.main_thread()
+    begin = module.start
+
+    def signalled(*given: object) -> object:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return begin(*given)
+
+    monkeypatch.setattr(module, "start", signalled)
+    with pytest.raises(StoppedError, match="stopped at step 0"):
+        train("random", tmp_path / "run", steps=200)
+    monkeypatch.undo()
+    assert train("random", tmp_path / "run", steps=200).rows()
 
 
 def test_a_service_that_is_not_installed_is_missed_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

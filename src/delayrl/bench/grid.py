@@ -127,13 +127,16 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
             own = item.get("overrides", {})
             cells += _cells(shared | item | {"overrides": _merge(shared["overrides"], own)})
             _check_overrides(own, item.get("agents", shared.get("agents", [])))
+            _check_tables(own, item.get("agents", shared.get("agents", [])))
         except DelayRLError as error:
             raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
     if not cells:
         raise DelayRLError("there are no products, so nothing to run")
     if products:
         lists = [item.get("agents", shared.get("agents", [])) for item in products]
-        _check_overrides(shared["overrides"], [agent for agents in lists for agent in agents])
+        every = [agent for agents in lists for agent in agents]
+        _check_overrides(shared["overrides"], every)
+        _check_tables(shared["overrides"], every)
     return cells
 
 
@@ -162,6 +165,13 @@ def _check_overrides(overrides: Mapping[str, Any], agents: Sequence[str]) -> Non
     presets = [preset for agent in agents for preset in find_agent(agent).presets.values()]
     names = [name for name, value in overrides.items() if not isinstance(value, dict)]
     check_names(names, *(config for preset in presets for config in preset))
+
+
+def _check_tables(overrides: Mapping[str, Any], agents: Sequence[str]) -> None:
+    """Raise DelayRLError for a table of overrides of an agent that is not there: it would be ignored."""
+    for name, value in overrides.items():
+        if isinstance(value, dict) and name not in agents:
+            raise DelayRLError(f"there are overrides of {name}, which is not among the agents {', '.join(agents)}")
 
 
 def _applicable(overrides: Mapping[str, Any], agent: str) -> dict[str, Any]:

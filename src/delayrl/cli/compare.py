@@ -24,7 +24,7 @@ def run(given: argparse.Namespace) -> None:
     """Print the options that differ and the returns, and draw the learning curves."""
     from delayrl.play.plots import curves
     from delayrl.play.run import seed_runs
-    from delayrl.report.statistics import area, common_steps, mean_interval
+    from delayrl.report.statistics import FEWEST, area, common_steps, mean_interval
 
     if not 2 <= len(given.runs) <= len(LABELS):
         raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")
@@ -56,7 +56,9 @@ def run(given: argparse.Namespace) -> None:
     print()
     print_table(["", "steps", "seeds", "last return", "mean over training"], rows)
     if any(len(group) > 1 for group in groups):
-        print("[low, high]: 95 % bootstrap interval over seeds")
+        few = any(1 < len(group) < FEWEST for group in groups)
+        more = f"; with fewer than {FEWEST} it is about their range, and covers less" if few else ""
+        print(f"[low, high]: 95 % bootstrap interval over seeds{more}")
     curves(drawn, given.out, configs[0]["env"] if len({config["env"] for config in configs}) == 1 else "")
     print(f"{given.out}: learning curves")
 

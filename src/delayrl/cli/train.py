@@ -59,7 +59,6 @@ def _add_options_of_a_run(parser: Parser, folder: str) -> None:
     parser.add_argument("run", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--steps", type=whole, required=True, help="the new number of steps, from the run's beginning")
     add_stored(parser)
-    add_env_kwargs(parser)
     _add_ways(parser)
 
 
@@ -101,7 +100,9 @@ def run(given: argparse.Namespace) -> None:
     from delayrl.training.further import go_on
     from delayrl.training.train import train
 
-    values = vars(given) | {"env_kwargs": dict(given.env_kwargs)}
+    values = dict(vars(given))
+    if "env_kwargs" in values:
+        values["env_kwargs"] = dict(values["env_kwargs"])
     runs = (go_on if "run" in values else train)(progress=not values.pop("quiet"), **values)
     for result in runs if isinstance(runs, list) else [runs]:
         _print_summary(result)

@@ -1,6 +1,7 @@
 """Write a report of files of rows: `python -m delayrl.report ROWS --out DIR`."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from delayrl.errors import DelayRLError
@@ -17,9 +18,12 @@ def main() -> None:
     parser.add_argument("--title", default="delayrl", help="title of the report (default: delayrl)")
     given = parser.parse_args()
     try:
-        print(report(read_rows(given.rows), [], given.out, given.title, configs=read_configs(given.rows)))
+        configs = list(read_configs(given.rows))
+        versions = [config["versions"] for config in configs if isinstance(config, dict) and config.get("versions")]
+        print(report(read_rows(given.rows), [], given.out, given.title, versions, configs))
     except DelayRLError as error:
-        raise SystemExit(f"error: {error}") from None
+        print(f"delayrl: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":

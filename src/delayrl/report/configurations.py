@@ -13,6 +13,8 @@ from delayrl.run.folder import RunFolder
 
 Config = Mapping[str, Any]
 """What a run's config.json holds."""
+FROM = "from"
+"""The name under which results say which run's networks they began with."""
 
 
 def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
@@ -38,9 +40,19 @@ def by_key(configs: Iterable[Config]) -> dict[Key, Config]:
     return known
 
 
+def _beginning(config: Config) -> dict[str, str]:
+    """Return in words what a run began with, and how long it was planned before, if anything."""
+    origin, words = config.get("origin", {}), {}
+    if source := origin.get("from"):
+        words[FROM] = f"{source.get('agent')}@{source.get('step')}"
+    if lengths := origin.get("lengths"):
+        words["went_on"] = ", ".join(map(str, lengths))
+    return words
+
+
 def distinct_overrides(groups: Sequence[RowGroup]) -> list[dict[str, Any]]:
     """Return overrides that tell groups of different configurations apart: by what differs, or else by the hash."""
-    overrides = [overrides_of(group.config) for group in groups]
+    overrides = [overrides_of(group.config) | _beginning(group.config) for group in groups]
     alike: dict[str, set[str | None]] = defaultdict(set)
     names = []
     for group, own in zip(groups, overrides, strict=True):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.report import statistics
+from delayrl.report.configurations import FROM
 from delayrl.report.rows import RowGroup
 from delayrl.report.statistics import NAN, Floats, Stratum
 from delayrl.run.cell import Cell, CellState, Progress, Standing
@@ -148,8 +149,9 @@ class Result:
 
     @property
     def threshold(self) -> float:
-        """The reference's smoothed return after its last step; NaN without a reference."""
-        return statistics.mean_std(self.reference_anchor.smoothed)[0]
+        """The reference's smoothed return after its last step; NaN without anchors, or if `random` is as good."""
+        better = self.reference_anchor.value > self.random_anchor.value
+        return statistics.mean_std(self.reference_anchor.smoothed)[0] if better else NAN
 
     @property
     def missed(self) -> bool:
@@ -160,7 +162,7 @@ class Result:
     @cached_property
     def steps_interval(self) -> tuple[float, float]:
         """95 % interval of it, infinite where the threshold is not reached; NaN where it is unknown."""
-        if not self.runs or self.is_anchor:
+        if not self.runs or self.is_anchor or math.isnan(self.threshold):
             return NAN, NAN
         return statistics.bootstrap_steps(self.curves.steps, self.smoothed, self.reference_anchor.smoothed)
 
@@ -257,12 +259,12 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
     setting, env = result.place.setting, result.place.env
     near = [o for o in others if o.place.setting.protocol == setting.protocol and o.place.env == env and o.runs]
     random = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
-    ended = [o for o in near if o.place.setting == setting and not o.partial]
+    ended = [o for o in near if o.place.setting == setting and not o.partial and FROM not in o.condition.overrides]
     trained = [o for o in ended if o.condition.steps == result.condition.steps]
     plain = [o for o in trained if o.condition.agent == "sac" and o.place.delay == 0]
     random_anchor = reference_anchor = NO_ANCHOR
     if random:  # it does not learn, so that all its evaluations are alike
-        best = min(random, key=_fewest_overrides)
+        best = min(random, key=lambda o: (o.partial, -o.runs, o.place.setting != setting, _fewest_overrides(o)))
         random_anchor = Anchor(best.curves.returns.mean(1), best.smoothed[:, -1], "random")
     if plain:
         best = min(plain, key=_fewest_overrides)
@@ -271,4 +273,4 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
 
 
 def _fewest_overrides(result: Result) -> tuple[Any, ...]:
-    return len(result.condition.overrides), _order(result)
+    return len(result.condition.overrides), -result.runs, _order(result)

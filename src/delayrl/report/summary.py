@@ -174,9 +174,11 @@ def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
             chosen[place.setting, delay][place.label].append(result)
     aggregates = []
     for (setting, delay), results_of in chosen.items():
-        tasks_of = {label: {(r.place.env, r.place.delay) for r in own} for label, own in results_of.items()}
+        tasks_of = {
+            label: {(r.place.env, r.place.delay, r.condition.steps) for r in own} for label, own in results_of.items()
+        }
         every = set().union(*tasks_of.values())
-        if delay is None and len({constant for _, constant in every}) == 1:
+        if delay is None and len({constant for _, constant, _ in every}) == 1:
             continue  # the same as at this delay
         whole = [label for label, tasks in tasks_of.items() if tasks == every]
         if len(whole) > 1 or len(results_of) == 1:

@@ -86,7 +86,7 @@ def make_tables(results: Mapping[Place, Result]) -> list[Table]:
             ablation = [r for r in variants if (r.place.env, r.place.delay) in compared]
             tables.append(_table("ablation", f"Ablation of {agent}", setting, ablation, results))
         stochastic = [r for r in main if isinstance(r.place.delay, str)]
-        tables.append(_table("stochastic", "Normalised return, stochastic delays", setting, stochastic, results))
+        tables.append(_table("stochastic", "Normalised return, other delays", setting, stochastic, results))
     return [table for table in tables if table.rows]
 
 
@@ -112,7 +112,8 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], resul
         measure = "steps" if kind == "steps" else "normalised"
         key = (measure, env.removeprefix("delayrl/"), str(delay), agent, representation)
         same = overrides.keys() <= SAME_RUN and (result is None or _is_whole(result))  # the paper ran no other variants
-        entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None)
+        lengths = {r.condition.steps for r in chosen if (r.place.env, r.place.delay) == (env, delay)}
+        entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None, len(lengths) > 1)
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
 
 
@@ -121,11 +122,12 @@ def _is_whole(result: Result) -> bool:
     return not result.runs or (result.options_known and not result.partial)
 
 
-def _entry(kind: Kind, result: Result | None, published: PublishedValue | None) -> TableEntry:
+def _entry(kind: Kind, result: Result | None, published: PublishedValue | None, several_lengths: bool) -> TableEntry:
     if result is None or (result.progress.state == "todo" and not result.runs):
         return TableEntry(published=published)
     raw, raw_std = statistics.mean_std(result.curves.final)
-    notes = [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
+    notes = [f"{result.condition.steps:,} steps"] if several_lengths else []
+    notes += [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
     area = area_std = NAN
     if kind == "steps":
         value, std, interval = result.steps_to_threshold, NAN, result.steps_interval

@@ -96,7 +96,8 @@ def caption(table: Table) -> str:
             "Raw: return after the last step."
         )
     return (
-        "Final return, mean ± standard deviation over seeds; 95 % interval of the mean, with the anchors' uncertainty. "
+        "Final return, mean ± standard deviation over seeds; 95 % interval of the mean, with the anchors' uncertainty "
+        f"(with fewer than {FEWEST} seeds about their range, which covers less: 75 % with three). "
         "Area: normalised mean return over training. Raw: return after the last step."
     )
 

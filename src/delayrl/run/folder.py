@@ -63,7 +63,7 @@ class RunFolder:
         self.check_exists()
         try:
             config = json.loads(file.read_text())
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, RecursionError) as error:
             raise DelayRLError(f"{file} is damaged: {type(error).__name__}") from error
         for name, kind in CONFIG.items():
             if not isinstance(config, dict) or not isinstance(config.get(name), kind):
@@ -247,7 +247,7 @@ def is_config(file: Path) -> bool:
     """Whether a file is the configuration of a run, of any version: damaged, it stands beside a run's rows."""
     try:
         whole = CONFIG.keys() <= json.loads(file.read_text()).keys()
-    except (ValueError, OSError, AttributeError):
+    except (ValueError, OSError, AttributeError, RecursionError):
         whole = False
     return whole or (file.parent / "rows.jsonl").exists()
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from delayrl.agents.registry import AGENTS
 from delayrl.delays import Delay
-from delayrl.envs.task import Task, TaskLike, stored_task
+from delayrl.envs.task import Task, TaskLike, as_task, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import trained_delay
 from delayrl.play.run import Run
@@ -23,7 +23,6 @@ def go_on(
     steps: int,
     *,
     env: TaskLike | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
     agent: AgentLike | None = None,
     device: str | None = None,
     track: str | None = None,
@@ -40,8 +39,8 @@ def go_on(
     Args:
         run: the run folder, or the folder of the run folders of several seeds, which go on in lockstep.
         steps: the new number of environment steps, from the beginning of the run.
-        env: what makes the environment, as `load`.
-        env_kwargs: keyword arguments of the environment that replace or complete the run's.
+        env: what makes the environment, as `load`. It has to be the same task: its keyword arguments and wrappers are
+            the run's, and rows go on to name what the run began with.
         agent: the agent, as `load`.
         device: as `train`.
         track: as `train`.
@@ -58,10 +57,16 @@ def go_on(
     """
     runs = seed_folders(run)
     configs = [one.config for one in runs]
-    task = stored_task(configs[0]["env"], runs[0].path, env, env_kwargs)
+    task = stored_task(configs[0]["env"], runs[0].path, env)
     if agent is None:
         agent = str(configs[0]["agent"])
         find_agent(agent, runs[0].path)  # refuses code that came with the folder
+    named = as_task(configs[0]["env"])
+    moved = ":" in named.env.name or named.env.name.startswith("<")  # code may stand elsewhere now
+    name = task.env.name if moved else named.env.name
+    if (task.env.name, task.env.kwargs, task.wrappers) != (name, named.env.kwargs, named.wrappers):
+        hint = f"--from {runs[0].path} starts a new run with its networks"
+        raise DelayRLError(f"a run goes on in its own task, {named}; got {task}: {hint}")
     setup = setup_of(configs[0], agent, task, trained_delay(runs[0].path), steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
@@ -85,7 +90,8 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]
     setup = replace(setup, origin=origin)
-    return replace(setup, condition=replace(setup.condition, overrides=overrides_of(setup.config)))
+    names = {"agent": config["agent"], "env": config["env"]}  # its rows name what it began with
+    return replace(setup, condition=replace(setup.condition, **names, overrides=overrides_of(setup.config)))
 
 
 def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], steps: int) -> None:

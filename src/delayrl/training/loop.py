@@ -26,14 +26,13 @@ from delayrl.training.estimate import estimate
 from delayrl.training.learner import Stored
 from delayrl.training.recorder import Recorder
 from delayrl.training.resume import save
-from delayrl.training.signals import stop_signal
 from delayrl.training.state import Group, TrainState
 
 METRICS_EVERY = 1000
 
 
-def run(group: Group, state: TrainState, note: Callable[[str], None]) -> None:
-    """Train from a state to the last step, or until the callback ends it, and draw the learning curves.
+def run(group: Group, state: TrainState, note: Callable[[str], None], stopped: Callable[[], bool]) -> None:
+    """Train from a state to the last step, until `stopped()` or the callback ends it, and draw the learning curves.
 
     Raises:
         StoppedError: the process was asked to stop; the newest step is stored.
@@ -47,8 +46,8 @@ def run(group: Group, state: TrainState, note: Callable[[str], None]) -> None:
         interval = 0.5 if sys.stderr.isatty() else 30
         options = {"disable": not ways.progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
         bar = tqdm(total=steps, initial=state.step, unit="step", **options)
-        with stop_signal() as stop, bar:
-            loop.train(stop.is_set, bar)
+        with bar:
+            loop.train(stopped, bar)
     for folder in group.folders:
         curve(folder.read("rows"), folder.path / "curve.png")
 

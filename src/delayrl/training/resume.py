@@ -65,7 +65,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
             run.extend(run.config | group.setup.config | {"configuration": group.setup.configuration})
         run.rewind(newest.step)
         if complete:
-            run.finish(slim=not newest.can_go_on)
+            run.finish(slim=group.ways.slim or not newest.can_go_on)
     return state
 
 

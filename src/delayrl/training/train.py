@@ -31,6 +31,7 @@ from delayrl.training.loop import run
 from delayrl.training.machine import shared
 from delayrl.training.resume import source_of, start
 from delayrl.training.seeds import run_folders, seed_numbers
+from delayrl.training.signals import stop_signal
 from delayrl.training.state import Callback, Group, Ways
 
 
@@ -130,6 +131,7 @@ def train_group(
     if ways.device != "gpu":
         keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     with ExitStack() as held:
+        stop = held.enter_context(stop_signal())
         for folder in folders:
             held.enter_context(hold(folder.path))
         pool = held.enter_context(ThreadPoolExecutor(ways.threads))
@@ -153,4 +155,4 @@ def train_group(
         state = start(group, actors, overwrite, note)
         if state.step < setup.schedule.steps and (lines := shared(numbers, folders, ways.device)):
             note(lines)
-        run(group, state, note)
+        run(group, state, note, stop.is_set)
