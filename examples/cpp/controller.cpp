@@ -339,8 +339,8 @@ class Policy {
             action = mlp(head_, x);
         }
         for (std::size_t j = 0; j < action_size; ++j) {
-            if (!std::isfinite(action[j])) refuse("numbers so large that the action is not finite");
             action[j] = low_[j] + (std::tanh(action[j]) + 1) * ((high_[j] - low_[j]) / 2);
+            if (!std::isfinite(action[j])) refuse("numbers so large that the action is not finite");
         }
         return action;
     }

@@ -87,6 +87,20 @@ def test_backends_agree(name: str, tmp_path: Path, request: pytest.FixtureReques
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 
+def test_numbers_so_large_that_there_is_no_action(tmp_path: Path, controller: str) -> None:
+    """Each is finite, but not their sum: a NaN would be sent to the drives."""
+    policy = policy_of("bpql")
+    path = bundle_of(tmp_path / "bundle", policy)
+    obs = np.full(policy.spec.obs_size, 3e38, np.float32)
+    with pytest.raises(DelayRLError, match="so large that"):
+        load_bundle(path)(obs, np.zeros((policy.spec.delay, policy.spec.action_size)), 1)
+    line = " ".join(["1", *["3e38"] * policy.spec.obs_size, *["0"] * policy.spec.delay * policy.spec.action_size])
+    done = subprocess.run([controller, str(path)], input=line, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "not finite" in done.stderr
+    assert "nan" not in done.stdout
+
+
 @pytest.mark.parametrize("name", ["vdpo", "bpql", "any-age"])
 def test_preset_paper_agrees(name: str, tmp_path: Path, controller: str) -> None:
     """The widths and depth of the preset, at HalfCheetah's sizes and Δ = 25."""
