@@ -4,7 +4,11 @@ import re
 import runpy
 import shlex
 import sys
+import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,3 +64,39 @@ def test_the_rehearsal(late: int, tmp_path: Path, monkeypatch, capsys) -> None:
 
 def test_what_the_bundle_serves() -> None:
     assert f"  serves                   {served(3, 0, 0.04)}\n" in PAGE
+
+
+def test_the_loop_on_a_robot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It runs as it stands beside what is the reader's own, pauses after a stall, and ends with the safe command."""
+    spec = Spec(4, 1, 3)
+    policy = Policy(TINY["bpql"], random_state(TINY["bpql"], spec), spec, -np.ones(1), np.ones(1))
+    monkeypatch.chdir(tmp_path)
+    bundle_of(tmp_path / "my-bundle", policy, env=TASK, dt=0.02)
+    page = (ROOT / "docs" / "runtime.md").read_text()
+    code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
+    times: list[float] = []
+    sent: list[float] = []
+
+    def subscribe(deliver: Any) -> None:
+        def sensor() -> None:
+            while len(sent) < 12:  # then it is silent, and every decision is an overrun
+                deliver(SimpleNamespace(values=np.zeros(4), stamp=time.monotonic()))
+                time.sleep(0.005)
+
+        threading.Thread(target=sensor, daemon=True).start()
+
+    def send(command: Any) -> None:
+        sent.append(float(np.ravel(command)[0]))
+        times.append(time.monotonic())
+        if len(sent) == 6:
+            time.sleep(0.3)  # a stall of 15 periods
+
+    own = {"subscribe": subscribe, "send": send, "running": lambda: len(sent) < 30, "safe_command": np.full(1, 0.75)}
+    exec(compile(code, "loop.py", "exec"), own | {"standing": np.zeros(1)})
+    assert sent[-1] == 0.75
+    assert 0.75 not in sent[:12]
+    assert set(sent[-10:]) == {0.75}
+    assert min(np.diff(times[6:29])) > 0.01  # no burst
+    assert "overruns=" in capsys.readouterr().out
