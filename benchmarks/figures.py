@@ -101,18 +101,23 @@ def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any
 def table(name: str) -> str:
     """Return a Markdown table of each agent's returns on unseen start states, by seed and normalised.
 
+    Of the random policy, which learns nothing, all evaluations count.
+
     The interval of a normalised return is a bootstrap over the agent's seeds and those of both anchors.
     """
+    configs, rows, _ = read(name)
     by_agent = evaluations(name)
     means = {agent: [e["mean_return"] for _, e in runs] for agent, runs in by_agent.items()}
+    random = [run for run, config in configs.items() if config["agent"] == "random"]
+    every = [[row["return"] for row in rows if row["run"] == run] for run in random]
+    means |= {"random": [float(np.mean(returns)) for returns in every]} if every else {}
     anchors = "sac" in means and "random" in means
     normalised = ["normalised (interval)"] if anchors else []
     titles = ["agent", "mean return", *normalised, "each seed", "delay", "steps"]
     body = []
     for agent, runs in sorted(by_agent.items(), key=lambda item: -np.mean(means[item[0]])):
         config, evaluation = runs[0]
-        own = means[agent][:1] if agent == "random" else means[agent]  # which was evaluated alike for every seed
-        seeds = " · ".join(f"{mean:.1f}" for mean in own)
+        seeds = " · ".join(f"{mean:.1f}" for mean in means[agent])
         cells = [f"`{agent}`", f"{np.mean(means[agent]):.1f}"]
         if anchors:
             low, high = np.array(means["random"]), np.array(means["sac"])
@@ -155,7 +160,8 @@ def provenance(name: str) -> str:
     commits = sorted({config["versions"]["commit"] or "?" for config in configs.values()})
     episodes = lines[0]["evaluation"]["episodes"] if lines else 0
     return (
-        f"Each return is the mean of {episodes} episodes on start states that the run never saw, raw; protocol "
+        f"Each return is the mean of {episodes} episodes on start states that the run never saw, the same for all, and "
+        f"that of `random` of all its evaluations, raw; protocol "
         f"`{configs[0]['protocol']}`, preset `{configs[0]['preset']}`; {versions['cores']} x86 cores, "
         f"jax {versions['jax']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, "
         f"commit {', '.join(commits)}. The interval of three seeds is "

@@ -32,6 +32,7 @@ GOALS = [
     (WHOLE, BASE, ""),
     (WHOLE, "`bpql`, `critic_norm=layer`", "1.15"),
     (WHOLE, "`bpql`, preset `small`", ""),
+    ("`any-age`, preset `small`", "`bpql`, preset `small`", ""),
     ("`any-age`, `critic_norm=none`", BASE, "1.15"),
     ("`any-age`, `batch_size=128`", "`bpql`, `batch_size=128`", ""),
     (WHOLE, "`sac`, no delay, `critic_norm=layer`", "0.75"),

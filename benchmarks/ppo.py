@@ -45,7 +45,7 @@ def table() -> str:
     body = []
     for task, delay, view in sorted(curves, key=lambda key: (key[0], key[1] != "0", VIEWS.index(key[2]))):
         seeds = [list(curve.values()) for curve in curves[task, delay, view].values()]
-        last, mean = np.array([curve[-1] for curve in seeds]), np.array([np.mean(curve) for curve in seeds])
+        last, mean = np.array([curve[-1] for curve in seeds]), np.array([np.mean(curve[1:]) for curve in seeds])
         steps = max(next(iter(curves[task, delay, view].values())))
         each = " · ".join(f"{value:,.0f}" for value in last)
         spread = [f"{x.mean():,.0f}" + (f" ± {x.std(ddof=1):,.0f}" if len(x) > 1 else "") for x in (last, mean)]

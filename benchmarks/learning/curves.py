@@ -65,7 +65,7 @@ def table(runs: Runs) -> str:
     body = []
     for task, by_name in sorted(runs.items()):
         areas = {}
-        for who in sorted(by_name, key=list(COLOURS).index):
+        for who in sorted(by_name, key=order):
             steps, returns = statistics.common_steps([by_name[who][seed] for seed in sorted(by_name[who])])
             areas[who] = statistics.area(steps, returns)
             cells = [task, who, str(len(returns)), spread(areas[who]), spread(returns[:, -1])]
@@ -73,6 +73,11 @@ def table(runs: Runs) -> str:
             compared = difference(areas[who], areas.get(base)) if who != "delayrl" else ""
             body.append([*cells, compared and f"{compared} against {base}"])
     return markdown_table(head, body)
+
+
+def order(who: str) -> tuple[int, str]:
+    """Sort names as their colours stand, others behind them."""
+    return (list(COLOURS).index(who) if who in COLOURS else len(COLOURS)), who
 
 
 def spread(values: statistics.Floats) -> str:
@@ -94,9 +99,9 @@ def draw(runs: Runs, out: Path) -> None:
     figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 4.2), layout="constrained", squeeze=False)
     lines = {}
     for axes, (task, by_name) in zip(panels[0], sorted(runs.items()), strict=True):
-        for who in sorted(by_name, key=list(COLOURS).index):
+        for who in sorted(by_name, key=order):
             steps, returns = statistics.common_steps(list(by_name[who].values()))
-            lines[who] = curve(axes, steps, returns, COLOURS[who])
+            lines[who] = curve(axes, steps, returns, COLOURS.get(who, "#555555"))
         axes.set_title(f"{task}, no delay")
     figure.legend(lines.values(), lines, loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(out, dpi=130)

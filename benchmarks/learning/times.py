@@ -1,5 +1,6 @@
 """Tables and the picture of returns against wall-clock, from the rows of timed.py."""
 
+import itertools
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -101,15 +102,18 @@ def table(runs: Runs) -> str:
 
 
 def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
-    """Write how many times as long as ours a side takes to a return.
+    """Write how many times as long as ours a side takes to a return; a dash where neither reaches it.
 
-    Where half of its seeds do not reach it, that is a lower bound: those count as if they had at their last evaluation.
+    Where half of one's seeds do not, that is a bound: those count as if they had at their last evaluation.
     """
-    base = median(ours, value)[1]
-    if not np.isfinite(base):
+    theirs_does, ours_does = (np.isfinite(median(some, value)[1]) for some in (runs, ours))
+    if not (theirs_does or ours_does):
         return "–"
-    least = np.median([(reached(run, value) or (0, run.seconds[-1]))[1] for run in runs])
-    return f"{'' if np.isfinite(median(runs, value)[1]) else '> '}{least / base:.1f}"
+    theirs, own = (
+        np.median([(reached(run, value) or (0, run.seconds[-1]))[1] for run in some]) for some in (runs, ours)
+    )
+    sign = "" if theirs_does and ours_does else "> " if ours_does else "< "
+    return f"{sign}{theirs / own:.1f}"
 
 
 def ratios(runs: Runs, ours: str) -> str:
@@ -129,7 +133,7 @@ def draw(runs: Runs, out: Path) -> None:
     figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 4.2), layout="constrained", squeeze=False)
     sides = sorted({side for own in runs.values() for side in own})
     for axes, (delay, own) in zip(panels[0], sorted(runs.items()), strict=True):
-        for side, colour in zip(sides, COLOURS, strict=False):
+        for side, colour in zip(sides, itertools.cycle(COLOURS), strict=False):
             for i, run in enumerate(own.get(side, [])):
                 label = side.replace("`", "") if i == 0 else None
                 axes.plot(np.array(run.seconds) / 60, run.returns, color=colour, linewidth=1.4, label=label)
@@ -148,6 +152,15 @@ def section(folder: Path, picture: Path) -> str:
     runs, heads = read(folder)
     draw(runs, picture)
     tasks = ", ".join(sorted({head["config"]["env"] for head in heads}))
-    made = sorted({f"{key} {value}" for head in heads for key, value in head["versions"].items() if value})
-    about = f"{tasks}. Made with {', '.join(made)}. Rows: `benchmarks/results/times/`."
-    return f"{table(runs)}\n\n{ratios(runs, OURS)}\n\n{about}"
+    about = f"{tasks}. Rows: `benchmarks/results/times/`. Made with:"
+    return "\n\n".join([table(runs), ratios(runs, OURS), about, made_with(heads)])
+
+
+def made_with(heads: list[dict[str, Any]]) -> str:
+    """Write a line for each set of versions: which sides and seeds it made."""
+    runs: dict[str, list[str]] = defaultdict(list)
+    for head in heads:
+        config, used = head["config"], head["versions"] | {"commit": head["versions"].get("commit") or "unknown"}
+        words = ", ".join(f"{key} {value}" for key, value in used.items() if value and key not in ("cores", "machine"))
+        runs[words].append(f"{name(config)} Δ = {config['delay']} seed {config['seed']}")
+    return "\n".join(f"- {words}: {'; '.join(made)}." for words, made in runs.items())

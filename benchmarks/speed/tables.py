@@ -113,8 +113,9 @@ def spent(row: Row) -> float:
 
 
 def best_rate(row: Row) -> float:
-    """Return the highest rate in any row of the same device and threads, over all shapes."""
-    same = [r for r in read_rows() if r.get("floor") and (r["device"], r["threads"]) == (row["device"], row["threads"])]
+    """Return the highest rate, over all shapes, in any row of the same device, threads and day."""
+    alike = ("device", "threads", "date")
+    same = [r for r in read_rows() if r.get("floor") and all(r[name] == row[name] for name in alike)]
     return max(rate for r in same for rate in r["floor"]["rates"].values())
 
 
@@ -301,9 +302,10 @@ def pages(root: Path) -> dict[str, str]:
     if not every:
         return {}
     rows, own = ([row for row in every if (row["work"] in OWN) == ours] for ours in (False, True))
+    beside = [row for row in rows if not row["work"].startswith("size-")]
     draw_sizes(rows, root / "docs" / "img" / "performance-sizes.png")
     return {
-        "speed-compared": "\n\n".join(x for x in (compared(rows), behind(rows), provenance(rows)) if x),
+        "speed-compared": "\n\n".join(x for x in (compared(rows), behind(rows), provenance(beside)) if x),
         "speed-own": "\n\n".join((compared(own, ("first", "second")), provenance(own))),
         "speed-resources": resources(rows),
         "speed-parts": parts(rows),
@@ -314,6 +316,6 @@ def pages(root: Path) -> dict[str, str]:
             "tokens", "tokens", 640, "What that does to learning (0 takes whole windows):", timed=False
         ),
         "speed-precision": precision(),
-        "speed-sizes": sizes(rows),
+        "speed-sizes": "\n\n".join((sizes(rows), provenance([row for row in rows if row not in beside]))),
         "speed-memory": memory(),
     }

@@ -47,10 +47,12 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     assert ours[6:] == ["1,100", "16.7"]  # within the three minutes that all sides have
     assert theirs[2:] == ["1", "–", "–", "–", "-5", "–"]
     assert "after 3 minutes" in text
+    assert "- commit unknown: `bpql`, `matched` Δ = 5 seed 0; " in text
     late = [times.Run([1], [60.0], [value], 3.0) for value in (0.0, 0.0, 3000.0)]
     assert times.cell(late, 1000) == "– (1 of 3 seeds)"
     fast = [times.Run([1], [24.0], [3000.0], 3.0)]
-    assert [times.ratio(late, fast, 1000), times.ratio(fast, late, 1000)] == ["> 2.5", "–"]
+    assert [times.ratio(late, fast, 1000), times.ratio(fast, late, 1000)] == ["> 2.5", "< 0.4"]
+    assert times.ratio(late, late, 1000) == "–"
     pairs = {"ours": fast, "slow": [times.Run([1, 2], [60.0, 180.0], [1500.0, 0.0], 3.0)]}
     assert times.ratios({5: pairs}, "ours").splitlines()[2:] == ["| 5 | slow | 2.5 | > 7.5 | > 7.5 |"]
     mixed = [times.Run([1], [24.0], [3000.0], 3.0), times.Run([1, 2], [24.0, 96.0], [0.0, 0.0], 3.0)]

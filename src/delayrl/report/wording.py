@@ -230,7 +230,8 @@ def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:
     """Write a sentence for each machine and set of libraries; commits that differ in nothing else share one."""
     commits: dict[str, list[str]] = {}
     for used in versions:
-        hardware = f"{used.get('device')}, {used.get('cores')} cores, {used.get('machine')}"
+        kind = f" ({used['processor']})" if used.get("processor") else ""
+        hardware = f"{used.get('device')}, {used.get('cores')} cores, {used.get('machine')}{kind}"
         names = ("python", "jax", "mujoco", "gymnasium")
         libraries = ", ".join(f"{name} {used[name]}" for name in names if used.get(name))
         commits.setdefault(f"Made on {hardware}; {libraries}", []).append(str(used.get("commit") or "unknown"))

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,4 +37,12 @@ def versions() -> dict[str, Any]:
             used[package] = None
     (device,) = jnp.zeros(()).devices()  # where arrays are made now, which `--device cpu` changes
     machine = f"{platform.system()} {platform.machine()}"
-    return used | {"commit": commit(), "device": device.device_kind, "cores": os.cpu_count(), "machine": machine}
+    hardware = {"cores": os.cpu_count(), "machine": machine, "processor": processor()}
+    return used | {"commit": commit(), "device": device.device_kind} | hardware
+
+
+def processor() -> str | None:
+    """Return what the system calls the processor, if it says."""
+    about = Path("/proc/cpuinfo")
+    found = re.search(r"^model name\s*:\s*(.+)$", about.read_text(), re.MULTILINE) if about.exists() else None
+    return found[1] if found else platform.processor() or None
