@@ -14,6 +14,7 @@ from delayrl.delays import as_delay
 from delayrl.envs import make
 from delayrl.training import loop
 from delayrl.training.actor import Actor
+from delayrl.training.learner import Stored
 from delayrl.training.loop import Loop
 from delayrl.training.state import TrainState, Ways
 
@@ -21,8 +22,13 @@ SCHEDULE = Schedule(steps=10, random_steps=4, updates_per_call=2, evaluate_every
 SEEDS = [3, 4]
 
 
-def trained(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, protocol: Protocol = CORRECTED) -> tuple[list, Any]:
-    """Run the loop with a program that acts with 0.5 and learns nothing. Returns its calls and the executed actions."""
+def trained(
+    monkeypatch: pytest.MonkeyPatch, schedule: Schedule, protocol: Protocol = CORRECTED, stored: list | None = None
+) -> tuple[list, Any]:
+    """Run the loop with a program that acts with 0.5 and learns nothing. Returns its calls and the executed actions.
+
+    `stored` takes what the program is given to learn from.
+    """
     calls: list[tuple] = []
 
     class Recorder:
@@ -40,6 +46,8 @@ def trained(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, protocol: Proto
 
         def learn(self, learner: Any, pending: list, keys: Any, last: int, first: int) -> tuple:
             calls.append(("learn", last, len(pending)))
+            if stored is not None:
+                stored.extend(pending)
             return learner, {}, last >= first
 
     def save(group: Any, state: TrainState, *, complete: bool = False) -> TrainState:
@@ -77,6 +85,20 @@ def test_order(monkeypatch: pytest.MonkeyPatch) -> None:
         *(("act", 8), ("learn", 8, 2), ("evaluate", 8), ("save", 8, False)),
         *(("act", 9), ("act", 10), ("learn", 10, 2), ("evaluate", 10), ("save", 10, True)),
     ]
+
+
+def test_what_is_hidden_after_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many of the newest observations as are on their way after the step itself; none after an end."""
+    stored: list[list[Stored]] = []
+    trained(monkeypatch, Schedule(steps=40, random_steps=4, updates_per_call=2, evaluate_every=40), stored=stored)
+    assert len(stored) == 40
+    for own in zip(*stored, strict=True):
+        moment, hidden = 0, []
+        for step in own:
+            moment = 0 if step.transition.done else moment + 1
+            hidden.append(min(moment, 2))
+        assert [int(step.hidden) for step in own] == hidden
+        assert hidden.count(0) > 1
 
 
 def test_random_actions_are_of_seed_and_step(monkeypatch: pytest.MonkeyPatch) -> None:

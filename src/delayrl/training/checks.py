@@ -48,6 +48,8 @@ def check_memory(setup: Setup, spec: Spec, seeds: int, device: str | None) -> No
 def check_fit(setup: Setup, env: Delayed) -> State:
     """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
     agent, schedule, spec = setup.agent, setup.schedule, spec_of(env)
+    if agent.ahead(spec) < 1:  # the window of a step needs the row after it, or its action and reward are zeros
+        raise DelayRLError(f"an agent's ahead counts the steps of its targets, at least 1; got {agent.ahead(spec)}")
     least = 2 * (setup.delay.latest + agent.ahead(spec)) + 2
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:

@@ -92,7 +92,7 @@ class Loop:
         if len(state.pending) == self.group.setup.schedule.updates_per_call:
             self.learn()
         actions, state.actions = np.asarray(actions), None
-        transitions = self.group.apply(Actor.step, state.actors, actions)
+        transitions = list(self.group.apply(Actor.step, state.actors, actions))  # before asking what they leave hidden
         hidden = [hidden_steps(actor, self.group.setup.delay) for actor in state.actors]
         state.pending.append([Stored(*step) for step in zip(transitions, hidden, strict=True)])
         state.step += 1
