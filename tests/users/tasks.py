@@ -32,7 +32,7 @@ refused("delayrl train random --env arm:make --env-kwargs gain", "NAME=VALUE, e.
 refused("delayrl train random --env arm:mak", "did you mean make?")
 refused("delayrl train random --env arm", "unknown task 'arm'", "MODULE:NAME")
 refused("delayrl train random --env workshop:READY", "instance of Arm", "give its class, a function that makes it")
-refused("delayrl train random --env workshop:same", "returned the same environment twice")
+refused("delayrl train random --env workshop:same --quiet", "returned the same environment twice")
 
 point(1, "a task of one's own, in Python")
 for name, task in {
