@@ -1,11 +1,11 @@
 """Measure how many seed-steps a second this machine trains, by processes and seeds: `python benchmarks/machines.py`.
 
 One process has all cores; of several, each has one, as in `delayrl bench run`. They train their seeds in lockstep, and
-all of them learn while the clock runs. Writes rows and the table in docs/performance.md; `--table` only the table.
+all of them learn while the clock runs. Writes rows and the table in docs/performance.md; `--table` only the table,
+`--only AGENT` rows of that agent.
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -13,12 +13,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import blocks
 import numpy as np
 from figures import HERE, insert
 
 from delayrl.report.markdown import markdown_table
 
 ROWS = HERE / "results" / "machines.jsonl"
+NAMES = ("agent", "delay", "preset")
 WORKS = [("sac", 0, "small"), ("vdpo", 5, "small"), ("vdpo", 25, "small"), ("any-age", 25, "small")]
 SEEDS = (1, 4, 8)
 WARM, RANDOM = 300, 1000  # learned steps before the clock runs, and random ones before these
@@ -79,8 +81,8 @@ def speed(work: tuple[str, int, str], shares: list[list[int]], seeds: int, secon
     return seeds * sum(float(child.communicate()[0]) for child in children)
 
 
-def measure(rounds: int, seconds: int) -> None:
-    """Measure all works in turn and write the rows."""
+def measure(works: list[tuple[str, int, str]], rounds: int, seconds: int) -> None:
+    """Measure works in turn and write their rows."""
     from delayrl.run.provenance import versions
 
     available = sorted(os.sched_getaffinity(0))
@@ -88,33 +90,40 @@ def measure(rounds: int, seconds: int) -> None:
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as home:
         for number in range(rounds):
-            for work in WORKS:
+            for work in works:
                 for processes, seeds in ways:
                     size = len(available) // processes
                     shares = [available[i * size : (i + 1) * size] for i in range(processes)]
                     found = speed(work, shares, seeds, seconds, Path(home))
-                    about = dict(zip(("agent", "delay", "preset"), work, strict=True))
-                    rows.append(about | {"processes": processes, "seeds": seeds, "round": number, "speed": found})
+                    own = dict(zip(NAMES, work, strict=True))
+                    rows.append(own | {"processes": processes, "seeds": seeds, "round": number, "speed": found})
                     print(rows[-1], flush=True)
     about = {"versions": versions(), "cpus": os.cpu_count(), "seconds": seconds}
-    ROWS.write_text("".join(json.dumps(row) + "\n" for row in [about, *rows]))
+    blocks.replace(ROWS, about, rows, NAMES)
 
 
 def table() -> str:
-    """Return the medians as Markdown, the best of each line in bold."""
-    about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
-    ways = list(dict.fromkeys((row["processes"], row["seeds"]) for row in rows))
+    """Return the medians as Markdown, the best of each line in bold, and how each line was measured."""
+    measured = blocks.read(ROWS)
+    ways = list(dict.fromkeys((row["processes"], row["seeds"]) for _, rows in measured for row in rows))
     heads = [f"{processes} × {seeds}" for processes, seeds in ways]
-    body = []
-    for agent, delay in dict.fromkeys((row["agent"], row["delay"]) for row in rows):
-        own = [row for row in rows if (row["agent"], row["delay"]) == (agent, delay)]
-        medians = [np.median([row["speed"] for row in own if (row["processes"], row["seeds"]) == way]) for way in ways]
-        cells = [f"**{m:,.0f}**" if m == max(medians) else f"{m:,.0f}" for m in medians]
-        body.append([f"`{agent}`", delay, *cells])
-    rounds = 1 + max(row["round"] for row in rows)
-    words = f"Seed-steps a second, processes × seeds of each; median of {rounds} rounds of {about['seconds']} s of "
-    words += f"learning, HalfCheetah-v5, preset `small`; {about['cpus']} x86 cores, jax {about['versions']['jax']}. "
-    return f"{markdown_table(['agent', 'Δ', *heads], body)}\n\n{words}Rows: `benchmarks/results/machines.jsonl`."
+    lines, notes = [], []
+    for about, rows in measured:
+        agents = dict.fromkeys(row["agent"] for row in rows)
+        for agent, delay in dict.fromkeys((row["agent"], row["delay"]) for row in rows):
+            own = [row for row in rows if (row["agent"], row["delay"]) == (agent, delay)]
+            by_way = [[row["speed"] for row in own if (row["processes"], row["seeds"]) == way] for way in ways]
+            medians = [np.median(speeds) for speeds in by_way]
+            cells = [f"**{m:,.0f}**" if m == max(medians) else f"{m:,.0f}" for m in medians]
+            lines.append([f"`{agent}`", delay, *cells])
+        rounds = 1 + max(row["round"] for row in rows)
+        words = f"{rounds} rounds of {about['seconds']} s, {about['cpus']} x86 cores, jax {about['versions']['jax']}"
+        notes.append(f"{', '.join(f'`{agent}`' for agent in agents)}: {words}, commit {about['versions']['commit']}.")
+    words = (
+        "Seed-steps a second, processes × seeds of each; medians of rounds of learning, HalfCheetah-v5, preset `small`."
+    )
+    rows = "Rows: `benchmarks/results/machines.jsonl`."
+    return f"{markdown_table(['agent', 'Δ', *heads], lines)}\n\n{words} {' '.join(notes)} {rows}"
 
 
 if __name__ == "__main__":
@@ -122,7 +131,8 @@ if __name__ == "__main__":
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=int, default=10)
     parser.add_argument("--table", action="store_true", help="write the table alone")
+    parser.add_argument("--only", metavar="AGENT", choices=sorted({agent for agent, *_ in WORKS}))
     given = parser.parse_args()
     if not given.table:
-        measure(given.rounds, given.seconds)
+        measure([work for work in WORKS if given.only in (None, work[0])], given.rounds, given.seconds)
     insert(HERE.parent / "docs" / "performance.md", "machines", table())

@@ -1,11 +1,10 @@
 """Measure the time from starting `delayrl train` to its first learned step, compiling or compiled before.
 
-`python benchmarks/start.py` writes rows and the table in docs/performance.md; `--table` only the table. The ways
-alternate, so that other work on the machine meets both.
+`python benchmarks/start.py` writes rows and the table in docs/performance.md; `--table` only the table, `--only AGENT`
+rows of that agent. The ways alternate, so that other work on the machine meets both.
 """
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -13,12 +12,14 @@ import tempfile
 import time
 from pathlib import Path
 
+import blocks
 import numpy as np
 from figures import HERE, insert
 
 from delayrl.report.markdown import markdown_table
 
 ROWS = HERE / "results" / "start.jsonl"
+NAMES = ("agent", "delay", "preset")
 WORKS = [
     ("sac", 0, "small"),
     ("bpql", 25, "small"),
@@ -70,12 +71,12 @@ def seconds(agent: str, delay: int, preset: str, home: Path, kept: bool) -> floa
     return took
 
 
-def measure(rounds: int) -> None:
-    """Measure all works in turn and write the rows."""
+def measure(works: list[tuple[str, int, str]], rounds: int) -> None:
+    """Measure works in turn and write their rows."""
     from delayrl.run.provenance import versions
 
     rows = []
-    for agent, delay, preset in WORKS:
+    for agent, delay, preset in works:
         with tempfile.TemporaryDirectory() as home:
             seconds(agent, delay, preset, Path(home), kept=True)  # compiles
             for number in range(rounds):
@@ -94,33 +95,33 @@ def measure(rounds: int) -> None:
                     print(rows[-1], flush=True)
             size = sum(file.stat().st_size for file in Path(home, "delayrl").rglob("*") if file.is_file())
             rows[-1]["bytes"] = size
-    ROWS.write_text(
-        "".join(json.dumps(row) + "\n" for row in [{"versions": versions(), "cpus": os.cpu_count()}, *rows])
-    )
+    blocks.replace(ROWS, {"versions": versions(), "cpus": os.cpu_count()}, rows, NAMES)
 
 
 def table() -> str:
-    """Return the medians as Markdown."""
-    about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
-    body = []
-    for work in dict.fromkeys((row["agent"], row["delay"], row["preset"]) for row in rows):
-        own = [row for row in rows if (row["agent"], row["delay"], row["preset"]) == work]
-        medians = [np.median([row["seconds"] for row in own if row["kept"] is kept]) for kept in (False, True)]
-        size = next(row["bytes"] for row in own if "bytes" in row)
-        body.append([f"`{work[0]}`", work[1], f"`{work[2]}`", *(f"{m:.1f}" for m in medians), f"{size / 1e6:.1f}"])
-    table = markdown_table(["agent", "Δ", "preset", "compiling, s", "compiled before, s", "kept, MB"], body)
-    rounds = 1 + max(row["round"] for row in rows)
-    words = (
-        f"Median of {rounds} rounds, HalfCheetah-v5; {about['cpus']} x86 cores, Python {about['versions']['python']}, "
-    )
-    return f"{table}\n\n{words}jax {about['versions']['jax']}. Rows: `benchmarks/results/start.jsonl`."
+    """Return the medians as Markdown, and how each line was measured."""
+    lines, notes = [], []
+    for about, rows in blocks.read(ROWS):
+        works = dict.fromkeys(tuple(row[name] for name in NAMES) for row in rows)
+        for work in works:
+            own = [row for row in rows if tuple(row[name] for name in NAMES) == work]
+            medians = [np.median([row["seconds"] for row in own if row["kept"] is kept]) for kept in (False, True)]
+            size = next(row["bytes"] for row in own if "bytes" in row)
+            lines.append([f"`{work[0]}`", work[1], f"`{work[2]}`", *(f"{m:.1f}" for m in medians), f"{size / 1e6:.1f}"])
+        agents = ", ".join(dict.fromkeys(f"`{agent}`" for agent, *_ in works))
+        used = about["versions"]
+        words = f"{1 + max(row['round'] for row in rows)} rounds, {about['cpus']} x86 cores, Python {used['python']}"
+        notes.append(f"{agents}: {words}, jax {used['jax']}, commit {used['commit']}.")
+    table = markdown_table(["agent", "Δ", "preset", "compiling, s", "compiled before, s", "kept, MB"], lines)
+    return f"{table}\n\nMedians, HalfCheetah-v5. {' '.join(notes)} Rows: `benchmarks/results/start.jsonl`."
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--table", action="store_true", help="write the table alone")
+    parser.add_argument("--only", metavar="AGENT", choices=sorted({agent for agent, *_ in WORKS}))
     given = parser.parse_args()
     if not given.table:
-        measure(given.rounds)
+        measure([work for work in WORKS if given.only in (None, work[0])], given.rounds)
     insert(HERE.parent / "docs" / "performance.md", "start", table())
