@@ -183,7 +183,7 @@ def compare(work: Work, args: argparse.Namespace) -> dict[str, Any] | None:
             side_process.close()
     row: dict[str, Any] = {
         "work": work.name,
-        "title": work.title,
+        "title": work.title + f"; Python {sys.version_info.major}.{sys.version_info.minor}" * work.pythons,
         "device": args.device,
         "threads": args.threads,
         "steps": steps,
@@ -261,9 +261,14 @@ def interpreter(kind: str, args: argparse.Namespace) -> str | None:
 
 
 def write(row: dict[str, Any], path: Path) -> None:
-    """Replace the row of the same work, device and threads."""
+    """Replace the row of the same work, title, device and threads."""
     lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    kept = [line for line in lines if any(line[name] != row[name] for name in ("work", "device", "threads"))]
+    names = (
+        ("work", "title", "device", "threads")
+        if (WORKS | SIZES)[row["work"]].pythons
+        else ("work", "device", "threads")
+    )
+    kept = [line for line in lines if any(line[name] != row[name] for name in names)]
     order = [*WORKS, *SIZES]
     kept = [line for line in [*kept, row] if line["work"] in order]
     kept.sort(key=lambda line: (line["device"], order.index(line["work"]), -line["threads"]))

@@ -14,12 +14,14 @@ class Work:
         steps: environment steps of a slice, by device.
         sides: JSON objects for `ours` and `peer`, with `kind` (a function of worker.py), `env`, `delay`, `seeds` and
             `options`; ours also has `agent` and `preset`.
+        pythons: whether there is a row for each version of Python, whose JAX may differ.
     """
 
     name: str
     title: str
     steps: dict[str, int]
     sides: dict[str, dict[str, Any]]
+    pythons: bool = False
 
 
 def ours(agent: str, preset: str = "paper", delay: int = 0, seeds: int = 1, env: str = "", **options: Any) -> Any:
@@ -93,6 +95,7 @@ WORKS = {
             "SAC, preset `small`, HalfCheetah-v5, a replay with room for 1,000,000 rows; for 20,000, ours too",
             {"cpu": 100},
             {"ours": ours("sac", "small"), "peer": ours("sac", "small") | {"capacity": 20_000}},
+            pythons=True,
         ),
         _bfloat16("sac", "SAC, 256 × 256, batch 256, HalfCheetah-v5", 100, agent="sac"),
         _bfloat16("vdpo-5", "VDPO, preset `paper`, HalfCheetah-v5, Δ = 5", 10, agent="vdpo", delay=5),
