@@ -70,7 +70,7 @@ def speed(work: tuple[str, int, str], shares: list[list[int]], seeds: int, secon
     children = []
     for number, share in enumerate(shares):
         settings = ",".join(map(str, [RANDOM + WARM, seconds, *share]))
-        command = [sys.executable, "-c", CHILD, settings, *words, "--out", str(home / f"run{number}")]
+        command = [sys.executable, "-c", CHILD, settings, *words, "--out", str(home / f"run{number}-{seeds}")]
         children.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
     for child in children:
         if child.stdout.readline() != "ready\n":
