@@ -1,7 +1,7 @@
 """The ladder of any-age: what each part brings, from the rows of the grid `any-age-ladder`; cells that have ended.
 
-All arms have the seeds 0 to n - 1. Arms of one seed begin with the same random actions, and with the same actor if they
-have one encoder.
+All arms have the seeds 0 to n - 1. An arm of any-age is compared with any-age that has its batches. Arms of one seed
+begin with the same random actions, and with the same actor if they have one encoder.
 """
 
 import contextlib
@@ -113,13 +113,22 @@ def arm(condition: Condition) -> str:
     return ", ".join([*words, *(f"`{k}={v}`" for k, v in condition.overrides.items() if k != "precision")])
 
 
+def compared_with(result: Result) -> str:
+    """Return the arm of any-age that an arm of it is compared with: that with its batches, for that itself WHOLE."""
+    if result.condition.agent not in ("any-age", "crossq:ANY_AGE") or name(result) == WHOLE:
+        return ""
+    size = result.condition.overrides.get("batch_size")
+    alike = f"{WHOLE}, `batch_size={size}`" if size else WHOLE
+    return WHOLE if name(result) == alike else alike
+
+
 def table(results: list[Result], slower: Mapping[str, float] | None = None) -> str:
     """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms.
 
     `slower` has the time of each arm's update over that of BPQL's.
     """
     arms, slower = {name(r): r for r in results}, slower or {}
-    base, whole = arms.get(BASE), arms.get(WHOLE)
+    base = arms.get(BASE)
     head = ["arm", "seeds", "over training", "times BPQL's", "minus BPQL's"]
     head += ["`any-age` minus this arm, by seed", "at the end", f"above {AWAY:,}", "GFLOP", "update time / BPQL's"]
     body = []
@@ -127,8 +136,8 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
         own, final, other = area(result), result.curves.final, area(base) if base and base is not result else None
         cells = [name(result), str(result.runs), spread(own)]
         cells += ["", ""] if other is None else [ratio(own, other, result), difference(own, other)]
-        changed = whole and result.condition.agent == "any-age" and result is not whole
-        cells += [paired(area(whole), own) if whole and changed else ""]
+        whole = arms.get(compared_with(result))
+        cells += [paired(area(whole), own) if whole else ""]
         cells += [spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
         body.append([*cells, f"{slower[name(result)]:.2f}" if name(result) in slower else ""])
     return markdown_table(head, body)

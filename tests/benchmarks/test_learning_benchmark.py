@@ -88,6 +88,10 @@ def test_the_ladder_compares_with_bpql() -> None:
     whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
     line = ladder.table([whole, arm, base]).splitlines()[3].strip("| ").split(" | ")
     assert line[5] == "+300 (-2,241 to +2,841)"  # gaps of 500 and 100, t = 12.706; the third seed has no other
+    smaller = result("any-age", 25, [[2000.0, 2000.0], [2000.0, 1000.0]], batch_size=128)
+    changed = result("any-age", 25, [[1000.0, 1000.0], [1000.0, 1000.0]], batch_size=128, n_steps=5)
+    lines = [line.strip("| ").split(" | ") for line in ladder.table([whole, smaller, changed]).splitlines()[2:]]
+    assert [line[5].split(" ")[0] for line in lines] == ["", "+500", "+750"]  # each with any-age that has its batches
     front = ladder.front([base]).splitlines()[2].split(" | ")
     assert front[1:3] + front[4:6] == ["25", "0.30 (0.28 to 0.33)", "1,000 · 1,200", "0"]
     bare = replace(base, random_anchor=NO_ANCHOR)
