@@ -87,6 +87,21 @@ def test_official_starts() -> None:
     assert drawn <= {float(t.action[0]) for t in complete}
 
 
+def test_windows_are_whole_when_the_ring_closes() -> None:
+    """Steps that start Δ rows into their episode: the rows before them are overwritten before any step is."""
+    delay, capacity = 4, 40
+    transitions, _ = record(TASK, delay, 60)
+    append = jax.jit(ring.append, static_argnames="learnable")
+    replay, whole = ring.init(Spec(2, 1, delay), capacity), 0
+    for transition in transitions:
+        replay = append(replay, transition, ring.Learnable(first=delay))
+        if int(replay.rows) >= capacity:
+            windows = draw(replay, 500, delay, 1)
+            assert windows.valid[:, : delay + 1].all()
+            whole += int(replay.lost) == 0
+    assert whole > 2
+
+
 def test_round_trip() -> None:
     """What the wrapper showed is what `view` makes of the replay, at every step and every shorter delay."""
     for delay in (0, 1, 4, 9):

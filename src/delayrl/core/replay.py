@@ -116,7 +116,7 @@ def sample(
     capacity = replay.obs.shape[0]
     pick, length = jax.random.split(key)
     # the oldest steps of a full ring are not drawn: the Δ rows before them may be overwritten
-    first = jnp.where(replay.lost > 0, replay.lost + delay, 0)
+    first = jnp.where(replay.rows >= capacity, replay.lost + delay, 0)
     last = replay.steps - hidden
     step = jax.random.randint(pick, (batch, 1), jnp.minimum(first, last - 1), last)
     row = replay.row_of[step % capacity]
