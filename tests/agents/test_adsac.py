@@ -188,6 +188,18 @@ def test_a_coin_says_which_actor_learns() -> None:
     assert not same(even.auxiliary.critic, state.auxiliary.critic)
 
 
+def test_temperatures_are_updated_as_often_as_asked() -> None:
+    """`matched` throws a coin for each of its two actors, and updates the temperatures once for both."""
+    agent, state = started(actor_updates=2)
+    windows = windows_of()
+    for every in (1, 2):
+        new, _ = dataclasses.replace(agent, temperature_every=every).update(
+            state, windows, jax.random.key(0), jnp.int32(1)
+        )
+        counts = new.temperature_opt_state[0].count, new.auxiliary.temperature_opt_state[0].count
+        assert [int(count) for count in counts] == [2 // every, 2 // every]
+
+
 def test_augmented_actor_follows_both_critics() -> None:
     """A change of the second critic alone changes its update: the released code takes the first for both."""
     agent, state = started()

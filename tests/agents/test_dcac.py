@@ -240,6 +240,18 @@ def test_the_target_is_of_the_target_critics() -> None:
         np.testing.assert_allclose(metrics["actor_loss"], -gain, rtol=1e-4)
 
 
+def test_the_entropy_is_of_the_actions_that_count() -> None:
+    """Those of a stretch that a time limit or a random delay cuts do not enter a target, nor move the temperature."""
+    state, windows = parts()
+    cut = dataclasses.replace(windows, age=windows.age.at[:, 4:].set(1))  # the first step alone hides its action
+    rolls = jax.vmap(AGENT.roll, (None, 0, 0))(state.actor, cut, jax.random.split(jax.random.key(5), 16))
+    steps, log_prob = np.asarray(rolls.steps), np.asarray(rolls.log_prob)
+    assert steps.max() < 3
+    expected = -np.mean([x for own, n in zip(log_prob, steps, strict=True) for x in own[:n]])
+    _, metrics = AGENT.loss((state.actor, state.critic), state.target, cut, jax.random.key(5), 1.0)
+    np.testing.assert_allclose(metrics["entropy"], expected, rtol=1e-5)
+
+
 def test_gradient_reaches_the_first_action() -> None:
     """Each of the Δ new actions is one that the value at the end of the stretch can blame."""
     state, windows = parts()

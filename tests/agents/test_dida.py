@@ -141,6 +141,8 @@ def test_it_asks_for_what_it_needs() -> None:
     for schedule in (Schedule(steps=20, random_steps=5), Schedule(steps=40, random_steps=20)):
         with pytest.raises(DelayRLError, match="must lie between"):
             AGENT.for_run(schedule)
+    with pytest.raises(DelayRLError, match="must lie between"):
+        AGENT.for_run(Schedule(steps=40, random_steps=5, update_after=20))  # an expert that never learns
     uneven = dataclasses.replace(AGENT, expert_steps=12)
     with pytest.raises(DelayRLError, match=r"rounded up to whole rounds of 10, must lie between .* 5 and 20; got 12"):
         uneven.for_run(Schedule(steps=20, random_steps=5))

@@ -75,7 +75,7 @@ PAPER = {
         "tokens": 0,
         "at_age_0": "reference",
     },
-    "ad-sac": VDPO_SAC | {"auxiliary_delay": 0, "behaviour": "lower-q", "evaluation": "mode"},
+    "ad-sac": VDPO_SAC | {"auxiliary_delay": 0, "behaviour": "lower-q", "temperature_every": 1, "evaluation": "mode"},
     "dida": VDPO_SAC  # student: DIDA's code, train_dida.py; expert_steps and imitation_updates: ours (docs)
     | {
         "expert_steps": 500_000,
@@ -94,6 +94,7 @@ PAPER = {
         "reward_scale": 5.0,
         "temperature": "fixed",
         "entropy_scale": 1.0,
+        "temperature_learning_rate": 1e-3,  # unused: the temperature is fixed
         "discount": 0.99,
         "target_rate": 5e-3,
         "log_std_range": [-20.0, 2.0],
@@ -124,9 +125,13 @@ def test_paper(agent: str) -> None:
 
 @pytest.mark.parametrize("agent", [agent for agent in AGENTS if agent not in ("random", "dcac")])
 def test_matched(agent: str) -> None:
-    """Every option that agents share has one value. AD-SAC has two actors, of which an update improves one."""
+    """Every option that agents share has one value. AD-SAC has two actors, of which an update improves one.
+
+    So every network of every agent is updated once a step, temperatures included.
+    """
     values = values_of(AGENTS[agent].presets["matched"].agent)
-    shared = MATCHED | {"ad-sac": {"actor_updates": 4}, "any-age": {"critic_norm": "layer"}}.get(agent, {})
+    own_values = {"ad-sac": {"actor_updates": 4, "temperature_every": 2}}
+    shared = MATCHED | {**own_values, "any-age": {"critic_norm": "layer"}}.get(agent, {})
     assert {name: values[name] for name in shared} == shared
     own = {"learning_rate": 3e-4, "student_learning_rate": 3e-4, "student_hidden": [256, 256]}
     own |= {"student_batch_size": 256, "student_optimiser": "adam"}

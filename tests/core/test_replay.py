@@ -164,6 +164,23 @@ def test_hidden_observations_are_never_given(hidden: int) -> None:
     assert int(windows.lead.min()) == int(windows.n_step.min()) == 1  # the outcome of each has arrived
 
 
+def test_of_finished_episodes_nothing_is_hidden() -> None:
+    """Where an episode's first Δ steps are not learned from, fewer steps are hidden than observations."""
+    delay, learnable = 3, ring.Learnable(first=3)
+    transitions, _ = record(TASK, delay, 120)
+    while transitions[-1].done or transitions[-1].next_obs[0] != 4:  # one step of the current episode counts
+        transitions.pop()
+    replay = ring.init(Spec(2, 1, delay), 400)
+    for transition in transitions:
+        replay = jax.jit(ring.append, static_argnames="learnable")(replay, transition, learnable)
+    counts = [int(ring.drawable(replay, hidden, learnable)) for hidden in (0, 1, 3)]
+    assert counts == [int(replay.steps), int(replay.steps) - 1, int(replay.steps) - 1]
+    windows = ring.sample(replay, jax.random.key(0), 5000, delay, 1, jnp.int32(3), learnable=learnable)
+    drawn = set(np.asarray(windows.action[:, delay, 0]).tolist())
+    start = len(transitions) - 4
+    assert drawn == {float(t.action[0]) for t in transitions[:start] if t.obs[0] >= 3}
+
+
 def test_memory_of_humanoid() -> None:
     """A million steps of Humanoid take at most 1.7 GB, whatever Δ is."""
     for delay in (0, 50):

@@ -55,6 +55,10 @@ def test_policy_refuses_what_it_does_not_know(vdpo: Run) -> None:
         policy.act(obs[:4], {"age": 1, "actions": actions})
     with pytest.raises(delayrl.DelayRLError, match="needs the 3 actions"):
         policy.act(obs, {"age": 3, "actions": actions[:2]})
+    for wrong in (np.zeros(6), np.zeros((3, 1))):  # would be other actions for each joint
+        with pytest.raises(delayrl.DelayRLError, match="rows of 2 numbers; got shape"):
+            policy.act(obs, {"age": 3, "actions": wrong})
+    assert policy.act(obs, {"age": 0, "actions": []}).shape == (2,)
     with pytest.raises(delayrl.DelayRLError, match="not finite"):
         policy.act(obs * np.nan, {"age": 1, "actions": actions})
     for info in ({}, {"age": 1}, {"actions": actions}):

@@ -40,6 +40,18 @@ def test_a_checkpoint_of_the_same_step_is_replaced_only_when_complete(run: RunFo
     assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
 
 
+def test_a_checkpoint_stays_until_the_new_one_of_its_step_is_whole(run: RunFolder, monkeypatch) -> None:
+    """Killed while the old one is deleted: the new one has its name already."""
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "rmtree", lambda path, **_: killed() if path.exists() else None)
+    with pytest.raises(KeyboardInterrupt):
+        run.save(100, {"w": np.zeros(3, np.float32)}, LOOP, {})
+    assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
+
+
 def test_drafts_that_a_killed_process_left_are_deleted(run: RunFolder) -> None:
     home = run.path / "checkpoints"
     for name in (".draft", ".000000000150.draft"):  # of version 0.1, and of today

@@ -217,6 +217,30 @@ def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: py
         train("dcac", tmp_path / "dcac", start_from=old.path)
 
 
+def test_normalised_networks_come_with_their_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also as a reference; moments alone are nothing to begin with."""
+    old = train("sac", tmp_path / "sac", steps=200, observation_norm="running")
+    train("vdpo", tmp_path / "vdpo", steps=100, start_from=old, observation_norm="running", progress=True)
+    said = capsys.readouterr().err
+    assert all(f"agent.reference.{name}" in said.split("new:")[0] for name in ("actor", "critic", "target"))
+    with pytest.raises(delayrl.DelayRLError, match="sac has no network that fits: it lacks"):
+        train("dcac", tmp_path / "dcac", start_from=old, observation_norm="running")
+
+
+def test_a_block_that_was_cut_does_not_go_on(tmp_path: Path) -> None:
+    run = train("bpql", tmp_path / "run", steps=200, updates_per_call=3, evaluate_every=150)
+    with pytest.raises(delayrl.DelayRLError, match="ended within a block of updates_per_call = 3 steps; --from"):
+        delayrl.go_on(run, 300, progress=False)
+
+
+def test_each_seed_keeps_its_own_replay(tmp_path: Path) -> None:
+    """One of two finished seeds was trained with --slim; asking for both again deletes nothing."""
+    train("bpql", tmp_path / "runs" / "seed0", steps=200, slim=True)
+    train("bpql", tmp_path / "runs" / "seed1", steps=200, seed=1)
+    train("bpql", tmp_path / "runs", steps=200, seeds=2)
+    assert list((tmp_path / "runs" / "seed1" / "replay").iterdir())
+
+
 def test_of_a_deeper_network_no_part_is_taken() -> None:
     """Two blocks of three would be no network that anyone trained. Counters and optimisers begin anew."""
     shallow = {"encoder.blocks.0.w": np.zeros(2), "steps": np.zeros((), int), "a_opt_state.0.mu": np.zeros(2)}

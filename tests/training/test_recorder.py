@@ -69,6 +69,9 @@ def test_official_evaluation_has_the_runs_start_state(played: Any) -> None:
     assert travel == [[reset_seed(seed, EVALUATION, 100, e) for e in range(2)] for seed in SEEDS]
     assert opening.shape == (2, 2, 1, 1)
     assert len(np.unique(opening)) == 4
+    for actions, numbers in zip(opening, travel, strict=True):  # not the draws of which start states are made
+        for own, number in zip(actions, numbers, strict=True):
+            assert own[0, 0] != np.float32(np.random.default_rng(number).uniform(-1, 1))
 
 
 def test_what_is_not_finite_is_not_written(played: Any) -> None:

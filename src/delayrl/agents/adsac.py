@@ -57,6 +57,7 @@ class ADSAC:
         Behaviour,
         "who acts in training: augmented, or lower-q (for τ = 0, the actor with the lower Q; else augmented)",
     ] = "lower-q"
+    temperature_every: Annotated[int, "coins from one update of both temperatures to the next"] = 1
     evaluation: Annotated[Literal["mode", "sample"], "action in evaluation; the released code samples"] = "mode"
 
     @property
@@ -154,13 +155,15 @@ class ADSAC:
         return jax.vmap(of_window)(windows, jnp.broadcast_to(ahead, windows.n_step.shape))
 
     def _improve(self, state: State, now: Inputs, target_entropy: float, key: Key, count: Int[Array, ""]) -> State:
-        """Improve a randomly chosen actor and both temperatures, `actor_updates` times, with the values of x^τ.
+        """Improve a randomly chosen actor `actor_updates` times, with the values of x^τ, and the temperatures as often.
 
+        With `temperature_every` the temperatures are updated after every such coin alone.
         All seeds share the coins. With one for each, `jax.vmap` would compute both actors' updates and drop one.
         """
         coin_key = jax.random.fold_in(jax.random.key(0), count)
         coins = jax.random.bernoulli(coin_key, shape=(self.learner.actor_updates,))
-        for coin, update_key in zip(coins, jax.random.split(key, self.learner.actor_updates), strict=True):
+        keys = jax.random.split(key, self.learner.actor_updates)
+        for number, (coin, update_key) in enumerate(zip(coins, keys, strict=True), 1):
             policy_key, auxiliary_key, augmented_key = jax.random.split(update_key, 3)
             state = jax.lax.cond(
                 coin,
@@ -169,6 +172,8 @@ class ADSAC:
                 state,
                 policy_key,
             )
+            if number % self.temperature_every:
+                continue
             adjust = self.learner.adjust_temperature
             auxiliary = adjust(state.auxiliary, now.auxiliary, target_entropy, auxiliary_key)
             own = adjust(augmented_learner(state), now.augmented, target_entropy, augmented_key)

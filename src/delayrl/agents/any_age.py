@@ -42,7 +42,9 @@ Encoder = Literal["mlp", "forecast", "transformer"]
 class AnyAge:
     """The any-age agent."""
 
-    bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, critic_norm="layer"))
+    bpql: sac.SAC = field(
+        default_factory=lambda: sac.SAC(actor_sees="augmented", entropy_unit="scaled", critic_norm="layer")
+    )
     second_age: Annotated[SecondAge, "the younger age that the actor learns at too: none, random in 0..d, or 0"] = (
         "random"
     )

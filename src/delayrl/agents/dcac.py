@@ -63,6 +63,7 @@ class DCAC:
     reward_scale: Annotated[float, "factor on the rewards"] = 5.0
     temperature: Annotated[Literal["fixed", "learned"], "whether the entropy's weight is learned, as in SAC"] = "fixed"
     entropy_scale: Annotated[float, "weight of the entropy, the initial one if it is learned"] = 1.0
+    temperature_learning_rate: Annotated[float, "Adam's step size for a learned temperature", (0.0, 1.0)] = 1e-3
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
     target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
     log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-20.0, 2.0)
@@ -97,7 +98,8 @@ class DCAC:
         if self.entropy_scale <= 0:
             raise DelayRLError(f"a learned temperature starts above 0: entropy_scale must; got {self.entropy_scale}")
         log_temperature = jnp.log(jnp.asarray(self.entropy_scale, jnp.float32))
-        return state._replace(log_temperature=log_temperature, temperature_opt_state=adam.init(log_temperature))
+        opt_state = optax.adam(self.temperature_learning_rate).init(log_temperature)
+        return state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
         """Return the actor's Gaussian at inputs `x`."""
@@ -126,6 +128,7 @@ class DCAC:
         def loss(log_temperature: Array) -> tuple[Array, None]:
             return temperature_loss(log_temperature, -metrics["entropy"], -windows.action.shape[-1]), None
 
+        adam = optax.adam(self.temperature_learning_rate)
         log_temperature, opt_state, _, _ = descend(adam, loss, state.log_temperature, state.temperature_opt_state)
         state = state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
         return state, metrics | {"temperature": temperature}
@@ -147,11 +150,12 @@ class DCAC:
         # without the rewards of a stretch, which do not depend on its new actions
         frozen = jax.lax.stop_gradient(critic)
         actor_loss = -self.soft_return(rolls, 0.0, temperature, values(frozen, rolls.x_last)).mean()
+        summed = jnp.arange(windows.delay) < rolls.steps[:, None]
         metrics = {
             "critic_loss": critic_loss,
             "actor_loss": actor_loss,
             "value": value.mean(),
-            "entropy": -rolls.log_prob.mean(),
+            "entropy": -jnp.where(summed, rolls.log_prob, 0).sum() / jnp.maximum(summed.sum(), 1),
             "target_steps": rolls.steps.mean(dtype=jnp.float32),
         }
         return self.actor_share * actor_loss + (1 - self.actor_share) * critic_loss, metrics

@@ -73,15 +73,16 @@ class DIDA:
         """Return the agent.
 
         Raises:
-            DelayRLError: the expert does not finish between the random steps and the end, or observations are
+            DelayRLError: the expert does not finish between its first update and the end, or observations are
                 normalised: their moments would still move what the frozen expert sees.
         """
         if schedule.observation_norm != "none":
             raise DelayRLError(f"dida takes observation_norm none; got {schedule.observation_norm}")
-        if not schedule.random_steps < self.expert_end < schedule.steps:
+        first = max(schedule.random_steps, schedule.first_update)
+        if not first < self.expert_end < schedule.steps:
             raise DelayRLError(
-                f"expert_steps, rounded up to whole rounds of {self.round_steps}, must lie between random_steps and "
-                f"steps, {schedule.random_steps} and {schedule.steps}; got {self.expert_steps}"
+                f"expert_steps, rounded up to whole rounds of {self.round_steps}, must lie between random_steps (or "
+                f"update_after) and steps, {first} and {schedule.steps}; got {self.expert_steps}"
             )
         return self
 

@@ -94,8 +94,6 @@ _SMALL_VDPO = VDPO(
 )
 _SMALL_DIDA = DIDA(_SMALL_SAC, expert_steps=10_000, round_steps=250, imitation_updates=250)
 
-_LAYER_NORMED = replace(_MATCHED_BPQL, critic_norm="layer")
-
 AGENTS: dict[str, Registration] = {
     "vdpo": Registration(
         "clones a delay-free SAC into a transformer on (last observation, actions since)",
@@ -106,7 +104,7 @@ AGENTS: dict[str, Registration] = {
     "any-age": Registration(
         "BPQL whose actor acts on a forecast of s_t, learned from states alone, at every age",
         "-",
-        _presets(AnyAge(_LAYER_NORMED), AnyAge(_LAYER_NORMED), AnyAge(replace(_SMALL_BPQL, critic_norm="layer"))),
+        _presets(AnyAge(), AnyAge(), AnyAge(replace(_SMALL_BPQL, critic_norm="layer"))),
     ),
     "lifting": Registration(
         "BPQL, pulled towards a delay-free SAC learned beside it, with an annealed weight (D²HPG-BPQL)",
@@ -122,7 +120,9 @@ AGENTS: dict[str, Registration] = {
     "ad-sac": Registration(
         "learns values for a shorter delay, and improves the actor of the long one by them",
         "Wu et al., ICML 2024",
-        _presets(ADSAC(), ADSAC(_MATCHED_ADSAC), ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))),
+        _presets(
+            ADSAC(), ADSAC(_MATCHED_ADSAC, temperature_every=2), ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))
+        ),
         replace(
             _VDPO,
             start_states="own",

@@ -62,6 +62,12 @@ def current_moment(replay: Replay) -> Int[Array, ""]:
     return replay.moment[replay.rows % replay.moment.shape[0]]
 
 
+def drawable(replay: Replay, hidden: Int[Array, ""] | int, learnable: Learnable = ALL) -> Int[Array, ""]:
+    """Return how many steps have arrived that can be sampled: all but those among the `hidden` newest steps."""
+    of_episode = current_moment(replay) - (learnable.first + learnable.until_end - 1)  # those of the current episode
+    return replay.steps - jnp.minimum(hidden, jnp.maximum(of_episode, 0))
+
+
 def append(
     replay: Replay, step: Transition, learnable: Learnable = ALL, moment: Int[Array, ""] | None = None
 ) -> Replay:
@@ -97,7 +103,14 @@ def append(
 
 
 def sample(
-    replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden: Int[Array, ""], log_scale: float = 0.0
+    replay: Replay,
+    key: Key,
+    batch: int,
+    delay: int,
+    ahead: int,
+    hidden: Int[Array, ""],
+    log_scale: float = 0.0,
+    learnable: Learnable = ALL,
 ) -> Window:
     """Sample windows around uniformly drawn steps. No window crosses the boundary of an episode.
 
@@ -109,6 +122,7 @@ def sample(
         ahead: number of rows after the step, which is the longest k of a k-step target.
         hidden: number of newest observations that have not arrived yet: the learner's age, 0 if it may see them all.
         log_scale: of the task's actions, which the windows carry.
+        learnable: as for `append`.
 
     Returns:
         Windows with a leading axis `batch`.
@@ -117,7 +131,7 @@ def sample(
     pick, length = jax.random.split(key)
     # the oldest steps of a full ring are not drawn: the Δ rows before them may be overwritten
     first = jnp.where(replay.rows >= capacity, replay.lost + delay, 0)
-    last = replay.steps - hidden
+    last = drawable(replay, hidden, learnable)
     step = jax.random.randint(pick, (batch, 1), jnp.minimum(first, last - 1), last)
     row = replay.row_of[step % capacity]
     # between two episodes the current row is still empty

@@ -31,7 +31,7 @@ def load_arrays(path: Path) -> Arrays:
         arrays = safetensors.numpy.load_file(path)
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise DelayRLError(f"{path} cannot be read: {first_line(error)}") from error
-    return {OLD_NAME.sub(r"\1opt_state", name): array for name, array in arrays.items()}
+    return arrays  # type: ignore[no-any-return]
 
 
 def flatten_tree(tree: Any) -> Arrays:
@@ -51,6 +51,7 @@ def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
 
     leaves, form = jax.tree_util.tree_flatten_with_path(template)
     expected = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    arrays = {name if name in expected else OLD_NAME.sub(r"\1opt_state", name): x for name, x in arrays.items()}
     for name in sorted(expected.keys() ^ arrays.keys()):
         verb = "lacks" if name in expected else "has"
         raise DelayRLError(f"{where} belongs to another agent or configuration: it {verb} {name}")

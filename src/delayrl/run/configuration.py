@@ -18,6 +18,8 @@ OLDER: Mapping[str, Any] = {
     "belief_weight": 0.0,
     "student_optimiser": "rmsprop",
     "temperature": "fixed",
+    "temperature_every": 1,
+    "temperature_learning_rate": 1e-3,
     "update_after": 0,
     "tokens": 0,
     "observation_norm": "none",

@@ -172,7 +172,8 @@ class RunFolder:
                 manifest = {"step": step, "complete": complete, "files": files, "pieces": pieces}
                 write_flushed(folder / "manifest.json", json.dumps(manifest).encode())
                 if final.exists():  # only now is there another for this step
-                    _delete_checkpoint(final)
+                    final.rename(_emptied(final.with_name(".gone")))
+            shutil.rmtree(final.with_name(".gone"), ignore_errors=True)
         self._drop_checkpoints(2)
 
     def finish(self, *, slim: bool) -> None:
@@ -254,7 +255,12 @@ def is_config(file: Path) -> bool:
 
 def _delete_checkpoint(path: Path) -> None:
     """Rename a checkpoint, then delete it: a crash leaves no half of it under its name."""
-    gone = path.with_name(".gone")
-    shutil.rmtree(gone, ignore_errors=True)
+    gone = _emptied(path.with_name(".gone"))
     path.rename(gone)
     shutil.rmtree(gone)
+
+
+def _emptied(path: Path) -> Path:
+    """Delete what a killed process left at a path; return the path."""
+    shutil.rmtree(path, ignore_errors=True)
+    return path

@@ -33,8 +33,9 @@ def go_on(
 ) -> Run | list[Run]:
     """Train a finished or unfinished run further, with its own options, up to more steps.
 
-    Its configuration says from then on how long it was before; its rows are those of one result. Options that an agent
-    takes as parts of the run, such as any-age's annealing, are parts of the new length.
+    Its configuration says from then on how long it was before; its rows are those of one result. All options stay as
+    they are, also those whose defaults depend on the length of a run, such as `replay_capacity`. Only any-age's
+    annealing, which is in parts of the run, is in parts of the new length.
 
     Args:
         run: the run folder, or the folder of the run folders of several seeds, which go on in lockstep.
@@ -103,6 +104,9 @@ def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], 
         raise DelayRLError(f"{run.path} has {least:,} steps; to train it further, give more than that: got {steps:,}")
     if steps > checkpoint.step:
         hint = f"--from {run.path} starts a new run with its networks"
+        block = config["schedule"].get("updates_per_call", 1)
+        if checkpoint.complete and checkpoint.step % block:  # or evaluating would change what is learned
+            raise DelayRLError(f"{run.path} ended within a block of updates_per_call = {block} steps; {hint}")
         if not checkpoint.can_go_on:
             raise DelayRLError(
                 f"{run.path} was trained with --slim, or by an older version, and keeps no replay; {hint}"

@@ -43,6 +43,7 @@ class Program:
 
     def __init__(self, agent: Agent, spec: Spec, learnable: ring.Learnable = ring.ALL) -> None:
         self.phases, self._agent, self._spec = agent.phases(), agent, spec
+        self.learnable = learnable
         self._append = functools.partial(ring.append, learnable=learnable)
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="first_phase", donate_argnums=0)
@@ -140,7 +141,7 @@ class Program:
                 for number in (step, index, i):
                     key = jax.random.fold_in(key, number)
                 sample_key, update_key = jax.random.split(key)
-                windows = ring.sample(replay, sample_key, *reach, hidden, log_scale)
+                windows = ring.sample(replay, sample_key, *reach, hidden, log_scale, self.learnable)
                 return phase.update(agent, windows, update_key, count)
 
             return jax.vmap(update_seed)(agent, replay, keys, jnp.asarray(hidden))

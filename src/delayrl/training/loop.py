@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from delayrl.core import replay as ring
 from delayrl.core.protocol import opening_length
 from delayrl.core.types import Metrics
 from delayrl.delays import Delay
@@ -141,7 +142,9 @@ class Loop:
 
     def _can_learn(self) -> bool:
         """Whether every seed has steps to learn from, even while its newest are hidden."""
-        return int(self.state.learner.replay.steps.min()) > self.group.setup.delay.latest
+        latest, learnable = self.group.setup.delay.latest, self.group.program.learnable
+        counts = jax.vmap(lambda replay: ring.drawable(replay, latest, learnable))(self.state.learner.replay)
+        return int(counts.min()) > 0
 
     def _random_actions(self) -> NDArray[np.float32]:
         generators = [np.random.default_rng([seed, RANDOM_ACTIONS, self.state.step]) for seed in self.group.seeds]

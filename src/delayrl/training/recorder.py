@@ -15,6 +15,9 @@ from delayrl.training.resume import KEPT
 from delayrl.training.state import Group
 from delayrl.training.tracking import Tracker
 
+OPENING = 3
+"""The stream of an evaluation's opening actions, apart from its start state and its delays (1) and noise (2)."""
+
 
 class Recorder:
     """Evaluates a group of seeds and writes rows and metrics; to a tracking service too, if `track` names one."""
@@ -46,7 +49,7 @@ class Recorder:
         resets = [[seed] * len(episodes) for seed in group.seeds] if protocol.start_states == "same" else own
         shape = (opening_length(protocol.evaluation_opening, group.spec.delay), group.spec.action_size)
         bound = 0 if protocol.evaluation_opening == "zeros" else 1
-        opens = [[np.random.default_rng(n).uniform(-bound, bound, shape) for n in row] for row in own]
+        opens = [[np.random.default_rng([n, OPENING]).uniform(-bound, bound, shape) for n in row] for row in own]
         opening = np.array(opens, np.float32)
         keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(group.keys)
         summary = []

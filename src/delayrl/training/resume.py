@@ -60,12 +60,12 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     newest = checkpoints[0]
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
-    for run in runs:
+    for run, checkpoint in zip(runs, checkpoints, strict=True):
         if run.config["schedule"]["steps"] != group.setup.schedule.steps:
             run.extend(run.config | group.setup.config | {"configuration": group.setup.configuration})
         run.rewind(newest.step)
         if complete:
-            run.finish(slim=group.ways.slim or not newest.can_go_on)
+            run.finish(slim=group.ways.slim or not checkpoint.can_go_on)
     return state
 
 
@@ -100,10 +100,12 @@ def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -
     """Return a fresh agent with the networks of another run that fit. Raises DelayRLError if none does."""
     arrays = source.arrays("agent")
     fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
-    inner = {name.removeprefix("reference."): array for name, array in arrays.items()}  # a reference is an agent itself
-    arrays = {f"reference.{name}": array for name, array in inner.items()} | inner | arrays
+    for name, array in dict(arrays).items():  # a reference is an agent itself; normalisation keeps the agent in `agent`
+        outer = "agent." * name.startswith("agent.")
+        inner = name.removeprefix(outer).removeprefix("reference.")
+        arrays = {f"{outer}reference.{inner}": array, f"{outer}{inner}": array} | arrays
     taken, left = fitting(fresh, arrays)
-    if not taken:
+    if not set(taken) - {"moments"}:
         where = source.path.parents[1]
         raise DelayRLError(f"{where} has no network that fits: it lacks {', '.join(left)}, or has them in other sizes")
     note(f"taken over: {', '.join(taken)}; new: {', '.join(left) or 'no network'}, and the optimisers")
