@@ -12,6 +12,7 @@ from collect import collect
 
 import delayrl
 from delayrl.agents.registry import AGENTS
+from delayrl.errors import DelayRLError
 from delayrl.run.folder import RunFolder
 
 SMALL_NETWORKS = {"hidden": [64, 64], "batch_size": 64}
@@ -44,10 +45,17 @@ def main() -> None:
         out = Path("runs/small") / given.task / agent
         delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
         print(f"{agent}: done", flush=True)
-    complete = [
-        path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if RunFolder(path).latest().complete
-    ]
+    complete = [path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if is_complete(path)]
     collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", complete, 20, every_delay=kind != given.task)
+
+
+def is_complete(path: Path) -> bool:
+    """Tell whether a run has ended. One without an intact checkpoint, such as one that was killed early, has not."""
+    try:
+        return RunFolder(path).latest().complete
+    except DelayRLError as error:
+        print(f"left out: {error}", flush=True)
+        return False
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.deploy import Controller, ControlPolicy, OverrunError
+from delayrl.deploy import ClockError, Controller, ControlPolicy, OverrunError
 from delayrl.errors import DelayRLError
 
 REPORT_EVERY = 10.0  # seconds
@@ -61,6 +61,10 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
                 self.get_logger().error(str(error))
                 if settings.get("idle") is not None:
                     self.controller.override(settings["idle"])
+                return
+            except ClockError as error:  # the clock stepped back, or a simulation began again
+                self.get_logger().error(str(error))
+                self.controller.reset()
                 return
             except DelayRLError as error:
                 self.get_logger().warning(str(error))

@@ -41,7 +41,7 @@ def play(controller: Controller, episode: int) -> tuple[float, list[np.ndarray]]
     truths, actions, total, done = [info["truth"]], [], 0.0, False
     while not done:
         step = len(actions)
-        made = step - info["age"]
+        made = step - info["age"] + controller.action_delay  # the age counts actions that have not acted yet
         controller.observe(truths[made], made, step)
         actions.append(controller.act(step))
         _, reward, terminated, truncated, info = env.step(actions[-1])

@@ -111,7 +111,7 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
         rows = [row for row in runs[0].rows() if row["step"] == step and row["policy"] == "agent"]
         return record(step, float(np.mean([row["return"] for row in rows])))
 
-    options = dict(text.split("=", 1) for text in given.set)
+    options = dict(map(pair, given.set))
     with tempfile.TemporaryDirectory() as folder:
         delayrl.train(
             given.side,
@@ -124,6 +124,15 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
             callback=after,
             **{"steps": given.steps, "evaluate_every": given.evaluate_every, "evaluation_episodes": EPISODES} | options,
         )
+
+
+def pair(text: str) -> tuple[str, Any]:
+    """Split NAME=VALUE; the value is JSON if it parses as JSON, otherwise text."""
+    name, _, value = text.partition("=")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
 
 
 def library(given: argparse.Namespace, clock: Clock, record: Record) -> None:

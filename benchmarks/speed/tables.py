@@ -124,18 +124,26 @@ def floors(rows: list[Row]) -> str:
     head = ["work", "GFLOP/step", "floor, ms", "processor, ms", "times the floor"]
     head += ["squares", "forward", "weights'", "inputs'"]
     body: list[list[str]] = []
-    for row in (r for r in rows if r.get("floor") and not r["work"].startswith("size-")):
+    shown = [r for r in rows if r.get("floor") and not r["work"].startswith("size-")]
+    for row in shown:
         least, rates = floor_seconds(row), row["floor"]["rates"]
         ours, words = spent(row), "" if row["device"] == "cpu" else " (whole step)"
         cells = [f"{row['floor']['flops'] / 1e9:.3f}", f"{1e3 * least:.2f}", f"{1e3 * ours:.2f}{words}"]
         cells += [f"{ours / least:.1f}"]
         cells += [f"{rates[name] / 1e9:.0f}" for name in ("square", "forward", "weights", "inputs")]
         body.append([row["title"].split(";")[0] + where(row, rows), *cells])
-    best: dict[str, float] = {}
-    for row in (r for r in rows if r.get("floor")):
-        best[row["device"]] = max(best_rate(row), best.get(row["device"], 0))
-    words = " and ".join(f"{v / 1e9:.0f} GFLOP/s{f' ({d})' if len(best) > 1 else ''}" for d, v in best.items())
-    return f"{markdown_table(head, body)}\n\nThe best rate seen: {words}."
+    return "\n\n".join(filter(None, (markdown_table(head, body), best_rates(shown))))
+
+
+def best_rates(rows: list[Row]) -> str:
+    """Return a sentence with the rate of these rows' floors; where there are several, with what each is of."""
+    rates = {(row["device"], f"{row['threads']} threads", row["date"]): best_rate(row) for row in rows}
+    told = [i for i in range(3) if len({of[i] for of in rates}) > 1]
+    each = []
+    for of, rate in sorted(rates.items()):
+        words = ", ".join(of[i] for i in told)
+        each.append(f"{rate / 1e9:.0f} GFLOP/s{words and f' ({words})'}")
+    return f"The best rate seen: {', '.join(each)}." if each else ""
 
 
 def operations() -> str:
@@ -192,9 +200,12 @@ def precision() -> str:
 
 
 def sizes(rows: list[Row]) -> str:
-    """Return a Markdown table of cost against Δ, seeds and task; cells that were not run are empty."""
-    head = ["preset", "task", "Δ", "seeds", "ms/step of a seed", "seed-steps/s", "processor ms/step", "floor, ms"]
-    head += ["replay", "peak MB"]
+    """Return a Markdown table of cost against Δ, seeds and task; cells that were not run are empty.
+
+    Each floor has the best rate of its own day, so that the rate stands beside it.
+    """
+    head = ["preset", "task", "Δ", "seeds", "ms/step of a seed", "seed-steps/s", "processor ms/step"]
+    head += ["floor, ms (at GFLOP/s)", "replay", "peak MB"]
     body, measured = [], once(rows)
     for name, work in SIZES.items():
         side, row = work.sides["ours"], measured.get(name)
@@ -203,7 +214,11 @@ def sizes(rows: list[Row]) -> str:
             ours, floor = row["ours"], row.get("floor")
             cells += [f"{1e3 * ours['seconds']['median']:.1f}", f"{ours['steps_per_second']:.1f}"]
             cells += [f"{1e3 * ours['processor']['median']:.1f}"]
-            cells += [f"{1e3 * floor_seconds(row):.2f}", f"{floor['replay_bytes'] / 1e9:.2f} GB"] if floor else ["", ""]
+            if floor:
+                cells += [f"{1e3 * floor_seconds(row):.2f} ({best_rate(row) / 1e9:.0f})"]
+                cells += [f"{floor['replay_bytes'] / 1e9:.2f} GB"]
+            else:
+                cells += ["", ""]
             cells += [f"{ours['peak_bytes'] / 1e6:.0f}"]
         body.append(cells + [""] * (len(head) - len(cells)))
     return markdown_table(head, body)

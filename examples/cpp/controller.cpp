@@ -7,7 +7,7 @@
 // Units are the task's own. `actions` are those applied since the observation was made, oldest first; entries after the
 // first `age` are ignored. The policy is stateless: keep the history yourself, by counting the actions that were applied.
 // The program reads bundle.json and policy.safetensors of format 1. It checks shapes, but no SHA-256 sums: check a bundle
-// from a network with `delayrl latency BUNDLE` or load_bundle first.
+// from a network with load_bundle in Python first.
 
 #include <algorithm>
 #include <chrono>

@@ -73,7 +73,8 @@ def test_target_entropy_of_a_task(env: str, target: float) -> None:
     """-A in the task's units is -A - Σ log half range in scaled ones."""
     spec = spec_of(make(env, 0, rescale=True))
     assert spec == spec_of(make(env, 0))
-    windows = ring.sample(ring.init(spec, 4), jax.random.key(0), 1, 0, 1, jnp.int32(0), spec.log_scale)
+    windows = ring.sample(ring.init(spec, 4), jax.random.key(0), 1, 0, 1, jnp.int32(0))
+    windows = replace(windows, log_scale=spec.log_scale)
     assert replace(TINY_SAC, entropy_unit="task").target_entropy(windows) == pytest.approx(target, abs=1e-3)
     assert replace(TINY_SAC, entropy_unit="scaled").target_entropy(windows) == -spec.action_size
 
@@ -83,7 +84,7 @@ def windows_of(log_scale: float):
     replay = ring.init(Spec(OBS, ACT, 0), 100)
     for transition in transitions:
         replay = jax.jit(ring.append)(replay, transition._replace(reward=np.float32(0)))
-    return ring.sample(replay, jax.random.key(0), 32, 0, 1, jnp.int32(0), log_scale)
+    return replace(ring.sample(replay, jax.random.key(0), 32, 0, 1, jnp.int32(0)), log_scale=log_scale)
 
 
 def test_entropy_in_values_and_temperature() -> None:

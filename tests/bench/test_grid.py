@@ -195,6 +195,16 @@ def test_grids_of_the_paper() -> None:
     assert sum(cell.id in first.ids for cell in ablation.cells) == 27  # the anchors, and VDPO itself
 
 
+def test_the_papers_row_has_both_anchors_under_both_protocols() -> None:
+    """The random policy, and delay-free SAC for at least as many steps as every learner: what its thresholds need."""
+    conditions = [cell.condition for cell in load_grid("evidence-1-paper").cells]
+    for protocol in ("corrected", "official"):
+        own = [c for c in conditions if c.protocol == protocol]
+        (reference,) = {c.steps for c in own if c.agent == "sac" and c.delay == 0}
+        assert all(c.steps <= reference for c in own)
+        assert [c.overrides for c in own if c.agent == "random"] == [{"steps": 20_000, "evaluation_episodes": 100}]
+
+
 def setup_of(c: Condition) -> Setup:
     return resolve(c.agent, c.env, c.delay, c.preset, c.protocol, c.overrides)
 

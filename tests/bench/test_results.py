@@ -321,6 +321,34 @@ def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:
     assert "8 rows; 1 of 2 cells are done" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["table", "table.db", "table.toml"])
+def test_a_table_of_any_name_is_reported(finished, tmp_path: Path, name: str, capsys) -> None:
+    """By its first bytes. What is only named like one is refused as a damaged table."""
+    grid, runs = finished
+    file = tmp_path / name
+    main(["bench", "collect", str(grid.source), "--runs", str(runs), "--out", str(file)])
+    main(["bench", "report", str(file)])
+    assert f"open {tmp_path / 'table-report' / 'report.html'}" in capsys.readouterr().out
+    assert "random" in (tmp_path / "table-report" / "report.md").read_text()
+    for text, words in ((b"no table", "no table of results, or damaged"), (None, "there is no table")):
+        other = tmp_path / "other.sqlite"
+        other.write_bytes(text) if text else other.unlink()
+        with pytest.raises(SystemExit):
+            main(["bench", "report", str(other)])
+        assert words in capsys.readouterr().err
+
+
+def test_a_grid_stays_a_grid(finished, tmp_path: Path, monkeypatch, capsys) -> None:
+    """Its name is not taken by a table in the current folder."""
+    grid, runs = finished
+    collect(grid, runs, tmp_path / "smoke")
+    monkeypatch.chdir(tmp_path)
+    main(["bench", "report", "smoke"])
+    assert "smoke: 0 of 10 cells are done" in capsys.readouterr().out
+    main(["bench", "report", "./smoke"])
+    assert "smoke: 1 of 2 cells are done" in capsys.readouterr().out
+
+
 def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkeypatch) -> None:
     """The label stands for hundreds of numbers."""
     monkeypatch.chdir(tmp_path)

@@ -9,15 +9,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks")]
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "learning")]
 
 import ladder  # noqa: E402
+import timed  # noqa: E402
 from learning import times  # noqa: E402
 
+import delayrl  # noqa: E402
 from delayrl.report.results import NO_ANCHOR, Anchor, Curves, Place, Result, Setting  # noqa: E402
 from delayrl.run.cell import Progress  # noqa: E402
 from delayrl.run.condition import Condition  # noqa: E402
 from delayrl.run.cost import Cost  # noqa: E402
+from delayrl.training.recorder import Recorder  # noqa: E402
 
 
 def write(folder: Path, side: str, seed: int, returns: list[float | None]) -> None:
@@ -58,6 +62,23 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     mixed = [times.Run([1], [24.0], [3000.0], 3.0), times.Run([1, 2], [24.0, 96.0], [0.0, 0.0], 3.0)]
     assert times.ratio(mixed, fast, 1000) == "> 2.5"  # 24 s, and more than 96
     assert (tmp_path / "times.png").stat().st_size > 5_000
+
+
+def test_options_on_the_command_line_are_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numbers, lists and truths reach `train` as such, names as text; the file of rows is named by the words."""
+    seen: dict[str, object] = {}
+    monkeypatch.setattr(Recorder, "evaluate", Recorder.evaluate)  # which a timed run replaces
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "0")
+    monkeypatch.setattr(delayrl, "train", lambda *_, **options: seen.update(options))
+    words = ["batch_size=64", "hidden=[8,8]", "online=true", "precision=bfloat16", "steps=500"]
+    command = ["timed.py", "bpql", "X-v0", "--delay", "5", "--out", str(tmp_path), "--set", *words]
+    monkeypatch.setattr(sys, "argv", command)
+    timed.main()
+    names = ("batch_size", "hidden", "online", "precision", "steps")
+    assert [seen[name] for name in names] == [64, [8, 8], True, "bfloat16", 500]
+    (file,) = tmp_path.iterdir()
+    assert file.name == f"bpql-matched-{'-'.join(words)}-X-v0-delay5-seed0.jsonl"
+    assert json.loads(file.read_text().splitlines()[0])["config"]["set"] == words
 
 
 REFERENCE = Anchor(np.full(2, 3900.0), np.zeros(2))

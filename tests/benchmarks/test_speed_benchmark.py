@@ -278,6 +278,30 @@ def test_both_sides_clone_once_a_slice() -> None:
     assert len(SIZES) > 10
 
 
+def test_rates_of_the_floors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the rows that a table shows. Each has its own day's, so it says which where it shows several."""
+    work, size = [next(r for r in tables.read_rows() if r["work"] == name) for name in ("vdpo-64", next(iter(SIZES)))]
+
+    def on(row: tables.Row, date: str, rate: float, **changes: str) -> tables.Row:
+        rates = dict.fromkeys(row["floor"]["rates"], rate * 1e9)
+        return row | {"date": date, "floor": row["floor"] | {"rates": rates}} | changes
+
+    shown = [on(work, "2026-01-01", 100), on(work, "2026-01-01", 150)]
+    hidden = [on(size, "2026-01-02", 300), on(size, "2026-01-03", 200, work=list(SIZES)[1])]
+    monkeypatch.setattr(tables, "read_rows", lambda: shown + hidden)
+    assert tables.floors(shown + hidden).endswith("|\n\nThe best rate seen: 150 GFLOP/s.")
+    later = [*shown, on(work, "2026-01-02", 50)]
+    words = "The best rate seen: 150 GFLOP/s (2026-01-01), 300 GFLOP/s (2026-01-02)."
+    assert tables.floors(later + hidden).endswith(words)
+    assert "rate" not in tables.floors(hidden)
+    flops = size["floor"]["flops"]
+    lines = tables.sizes(hidden).splitlines()[2:4]
+    assert [line.split(" | ")[7] for line in lines] == [
+        f"{flops / 3e8:.2f} (300)",
+        f"{flops / 2e8:.2f} (200)",
+    ]
+
+
 def test_tables_of_the_committed_rows(tmp_path: Path) -> None:
     """Every row shows, what was not run is empty, and where the peer is faster it is said."""
     rows = tables.read_rows()

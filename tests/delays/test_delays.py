@@ -190,9 +190,15 @@ def test_recorded_files(tmp_path: Path) -> None:
         ("0.1s", 0.1, 1),
         ("70ms", 0.01, 7),
         ("uniform:20ms:90ms", 0.02, 5),
+        ("900ms", float(np.float32(0.02)), 45),  # 45.000001 steps
+        ("899ms", float(np.float32(0.02)), 45),
+        ("901ms", float(np.float32(0.02)), 46),
+        ("20s", float(np.float32(0.02)), 1000),
+        ("910ms~", float(np.float32(0.02)), 46),  # 45.5 steps
     ],
 )
 def test_times_are_rounded_up(text: str, step: float, maximum: int) -> None:
+    """A step's length of single precision costs no step, however long the delay."""
     assert as_delay(text, step).maximum == maximum
 
 
@@ -307,6 +313,10 @@ def test_a_law_is_in_steps_or_in_time(text: str, words: str) -> None:
         ("3\ninf\n", "finite"),
         ("3\n2.5\n", "recorded:.*:ms"),
         ("3\nmany\n", "must be numbers"),
+        ("54,3\n61,0\n58,9\n", "line 1: several columns and no header, or decimal commas; write one number a line"),
+        ("54\n61,5\n", "line 2: several columns and no header, or decimal commas"),
+        ("delay\n54,3\n", "line 2: several columns and no header, or decimal commas"),
+        ("0,3\n1,1\n", "line 1: several columns and no header"),
     ],
 )
 def test_bad_recordings(content: str, words: str, tmp_path: Path) -> None:

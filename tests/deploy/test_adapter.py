@@ -1,5 +1,7 @@
 """Policies of other libraries in the controller and in bundles."""
 
+import runpy
+import sys
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,7 +10,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import FrameStackObservation, NormalizeObservation, RecordEpisodeStatistics, RescaleAction
+from gymnasium.wrappers import (
+    ClipReward,
+    FrameStackObservation,
+    NormalizeObservation,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+    RescaleAction,
+    TimeLimit,
+)
 
 from delayrl.deploy import Controller, adapt, export_layers, load_bundle, stable_baselines_layers
 from delayrl.deploy.hub import card
@@ -40,6 +50,20 @@ def mlp(layers: Layers, high: np.ndarray) -> Any:
         return high * np.tanh(x @ layers[-1][0] + layers[-1][1])
 
     return act
+
+
+class Spy:
+    """A policy that keeps the history that it was shown last."""
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.policy, name)
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        self.shown = actions.copy()
+        return self.policy(obs, actions, age)
 
 
 @pytest.mark.parametrize("delay", ["0", "3", "uniform:0:4", "episode:1:3", "uniform:0:2+action=2"])
@@ -100,6 +124,27 @@ def test_layers_in_a_bundle(name: str, delay: Any, tmp_path: Path) -> None:
     assert f"SAC on {name}" in card(bundle.metadata, "me/arm")
 
 
+def test_the_idle_action_comes_along(tmp_path: Path) -> None:
+    """The controller's history begins as the environment's did; a later period without a command holds the last one."""
+    idle = np.array([0.5, -9.0])  # is clipped to -1
+    env = AugmentedObservation(Delayed(gym.make("Reacher-v5"), "1+action=2", idle=idle))
+    layers = random_layers(env)
+    act = mlp(layers, env.action_space.high)
+    export_layers(layers, act, env, tmp_path / "bundle")
+    _, info = env.reset(seed=0)
+    for policy in (adapt(act, env), load_bundle(tmp_path / "bundle")):
+        np.testing.assert_array_equal(policy.idle, info["actions"][0])
+        for given, first in ((None, policy.idle), ([0.25, 0.25], [0.25, 0.25])):
+            spy = Spy(policy)
+            controller = Controller(spy, idle=given)
+            controller.observe(info["truth"], 0)
+            action = controller.act(0)
+            np.testing.assert_array_equal(spy.shown, [first, first, [0, 0]])
+            controller.observe(info["truth"], 1, now=2)
+            controller.act(2)  # the command of step 1 was missed
+            np.testing.assert_array_equal(spy.shown, [first, action, action if given is None else given])
+
+
 def test_layers_that_are_not_the_policy(tmp_path: Path) -> None:
     env = task(2)
     layers, other = random_layers(env), random_layers(env, 1)
@@ -128,7 +173,7 @@ def test_what_cannot_be_adapted(tmp_path: Path) -> None:
         (AugmentedObservation(NormalizeObservation(delayed)), "NormalizeObservation stands outside Delayed"),
         (NormalizeObservation(AugmentedObservation(delayed)), "NormalizeObservation stands outside Delayed"),
         (RescaleAction(AugmentedObservation(delayed), np.float32(-1), np.float32(1)), "RescaleAction stands outside"),
-        (FrameStackObservation(delayed, 2), "change what the policy sees"),
+        (FrameStackObservation(delayed, 2), "FrameStackObservation stands outside"),
         (task("1+action=uniform:0:2"), "one delay of the actions"),
     ):
         with pytest.raises(DelayRLError, match=words) as error:
@@ -139,6 +184,42 @@ def test_what_cannot_be_adapted(tmp_path: Path) -> None:
     lopsided = RescaleAction(gym.make("Reacher-v5"), np.float32(0), np.float32(1))
     with pytest.raises(DelayRLError, match="range around 0"):
         export_layers([], act, AugmentedObservation(Delayed(lopsided, 2)), tmp_path / "bundle")
+
+
+class Repeat(gym.Wrapper):
+    """Repeats actions and looks like the environment inside it."""
+
+    def step(self, action: np.ndarray) -> Any:
+        self.env.step(action)
+        return self.env.step(action)
+
+
+class Scaled(gym.Wrapper):
+    """Scales the first observation."""
+
+    def reset(self, **options: Any) -> Any:
+        obs, info = self.env.reset(**options)
+        return 2 * obs, info
+
+
+class Again(TimeLimit):
+    """Is no longer what it inherits from."""
+
+    step = Repeat.step
+
+
+def test_wrappers_outside_delayed() -> None:
+    delayed = Delayed(gym.make("Pendulum-v1"), 2)
+    for kind in (Repeat, Scaled, lambda env: Again(env, 10)):
+        for env in (kind(AugmentedObservation(delayed)), AugmentedObservation(kind(delayed)), kind(delayed)):
+            with pytest.raises(DelayRLError, match="stands outside Delayed, where no controller runs it: put"):
+                adapt(np.sin, env)
+    monitor = type("Monitor", (Repeat,), {"step": Repeat.step, "reset": Scaled.reset})
+    with pytest.raises(DelayRLError, match="Monitor stands outside"):
+        adapt(np.sin, monitor(delayed))
+    monitor.__module__ = "stable_baselines3.common.monitor"
+    for kind in (monitor, RecordEpisodeStatistics, NormalizeReward, lambda env: TimeLimit(ClipReward(env, -1), 10)):
+        assert adapt(np.sin, kind(AugmentedObservation(kind(delayed)))).max_age == 2
 
 
 class Tensor:
@@ -172,3 +253,27 @@ def test_the_actor_of_stable_baselines(tmp_path: Path) -> None:
         np.testing.assert_array_equal(b, wanted_b)
     with pytest.raises(DelayRLError, match="has no actor"):
         stable_baselines_layers(SimpleNamespace(policy=SimpleNamespace(mlp_extractor=None)))
+
+
+def test_the_example_with_delayed_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """examples/stable_baselines_robot.py on a stand-in for SAC."""
+    example = Path(__file__).parents[2] / "examples" / "stable_baselines_robot.py"
+
+    class Sac:
+        def __init__(self, policy: str, env: gym.Env, **_: Any) -> None:
+            self.layers, self.high = random_layers(env), env.action_space.high
+            names = ["latent_pi.0", "latent_pi.2", "mu"]
+            state = {f"{n}.weight": Tensor(w.T) for n, (w, _) in zip(names, self.layers, strict=True)}
+            state |= {f"{n}.bias": Tensor(b) for n, (_, b) in zip(names, self.layers, strict=True)}
+            self.policy = SimpleNamespace(actor=SimpleNamespace(state_dict=lambda: state))
+
+        def learn(self, steps: int) -> None:
+            pass
+
+        def predict(self, vector: np.ndarray, deterministic: bool) -> tuple[np.ndarray, None]:
+            return mlp(self.layers, self.high)(vector), None
+
+    monkeypatch.setitem(sys.modules, "stable_baselines3", SimpleNamespace(SAC=Sac))
+    words = ["--delay", "1+action=2", "--out", str(tmp_path / "bundle")]
+    monkeypatch.setattr(sys, "argv", [str(example), *words])
+    runpy.run_path(str(example), run_name="__main__")

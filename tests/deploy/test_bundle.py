@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
 from delayrl.deploy.backends.network import parse
-from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, seal
+from delayrl.deploy.export import bundle_files
+from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, read_files, seal, write_files
 from delayrl.errors import DelayRLError
 
 
@@ -216,12 +217,12 @@ class Bomb:
         return (os.mkdir, (str(self.path),))
 
 
-@pytest.mark.parametrize("which", ["weights", "graph"])
-def test_pickles_are_not_opened(bundle: Path, tmp_path: Path, which: str) -> None:
+def test_pickles_are_not_opened(bundle: Path, tmp_path: Path) -> None:
     bomb = pickle.dumps(Bomb(tmp_path / "executed"))
-    forge(bundle, **{which: bomb})
-    refused(bundle, "", "onnx")
     (bundle / "policy.pkl").write_bytes(bomb)
+    forge(bundle, graph=bomb)
+    load_bundle(bundle, "onnx")
+    forge(bundle, weights=bomb)
     refused(bundle, "", "onnx")
     assert not (tmp_path / "executed").exists()
     pickle.loads(bomb)
@@ -307,71 +308,55 @@ def test_links_and_pipes(bundle: Path, tmp_path: Path, name: str) -> None:
     outside = tmp_path / "outside"
     shutil.move(bundle / name, outside)
     (bundle / name).symlink_to(outside)
-    refused(bundle, "is a link", "onnx")
+
+    def unread(words: str) -> None:
+        with pytest.raises(DelayRLError, match=words):
+            read_files(bundle, (WEIGHTS, GRAPH))
+
+    unread("is a link")
     (bundle / name).unlink()
     os.mkfifo(bundle / name)
-    refused(bundle, "not a regular file", "onnx")
+    unread("not a regular file")
     (bundle / name).unlink()
     (bundle / name).mkdir()
-    refused(bundle, "", "onnx")
+    unread("not a regular|cannot be read")
 
 
-def test_foreign_graphs(bundle: Path, tmp_path: Path) -> None:
-    """A graph that does not compute the policy in the weights is refused."""
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
-
-    graph = (bundle / GRAPH).read_bytes()
+def test_a_graph_in_a_bundle_is_not_run(bundle: Path, tmp_path: Path) -> None:
+    """It is foreign, broken, not what bundle.json lists, or missing: the policy is that of the weights."""
     other = bundle_of(tmp_path / "other", policy_of("vdpo", seed=1))
-    renamed = onnx.load_from_string(graph)
-    renamed.graph.input[2].name = "delay"
-    for node in renamed.graph.node:
-        for i, name in enumerate(node.input):
-            if name == "age":
-                node.input[i] = "delay"
-    (tmp_path / "secret.bin").write_bytes(b"\0" * 1_000_000)
-    external = onnx.load_from_string(graph)
-    tensor = next(t for t in external.graph.initializer if len(t.dims) == 2 and t.data_type == TensorProto.FLOAT)
-    tensor.ClearField("raw_data")
-    tensor.data_location = TensorProto.EXTERNAL
-    tensor.external_data.add(key="location", value=str(tmp_path / "secret.bin"))
-    custom = onnx.load_from_string(graph)
-    custom.graph.node[0].domain = "evil.domain"
-    custom.opset_import.append(helper.make_opsetid("evil.domain", 1))
-    nothing = helper.make_graph(
-        [helper.make_node("Identity", ["c"], ["action"])],
-        "g",
-        [*list(renamed.graph.input)[:2], helper.make_tensor_value_info("age", TensorProto.INT64, [])],
-        list(renamed.graph.output),
-        [numpy_helper.from_array(np.zeros(2, np.float32), "c")],
-    )
-    constant = helper.make_model(nothing, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    for data, words in [
-        (b"", "cannot load"),
-        (b"garbage", "cannot load"),
-        (graph[: len(graph) // 2], "cannot load"),
-        ((other / GRAPH).read_bytes(), "other actions than the weights"),
-        (constant.SerializeToString(), "other actions than the weights"),
-        (renamed.SerializeToString(), "inputs and outputs"),
-        (external.SerializeToString(), "refers to another file"),
-        (custom.SerializeToString(), "cannot load"),
-    ]:
-        forge(bundle, graph=data)
-        refused(bundle, words, "onnx")
-        load_bundle(bundle)  # its weights are those that were exported
+    obs, actions = np.ones(10), np.full((4, 2), 0.1)
+    expected = load_bundle(bundle)(obs, actions, 3)
+    assert np.abs(load_bundle(other)(obs, actions, 3) - expected).max() > 0.01
+
+    def same() -> None:
+        np.testing.assert_allclose(load_bundle(bundle, "onnx")(obs, actions, 3), expected, rtol=0, atol=1e-5)
+
+    for graph in ((other / GRAPH).read_bytes(), b"", b"garbage"):
+        forge(bundle, graph=graph)
+        same()
+    (bundle / GRAPH).write_bytes(b"changed")
+    same()
+    (bundle / GRAPH).unlink()
+    same()
 
 
-def test_a_word_in_the_metadata_is_not_a_reference(tmp_path: Path) -> None:
-    path = bundle_of(tmp_path / "bundle", policy_of("bpql"), env="some/relocation-v0")
-    assert load_bundle(path, "onnx").metadata["env"] == "some/relocation-v0"
+def test_a_bundle_that_could_not_be_read_is_not_written(bundle: Path) -> None:
+    before = {file.name: file.read_bytes() for file in bundle.iterdir()}
+    words = r"^bundle.json would have 1,0\d\d,\d{3} bytes, a bundle allows 1,048,576: use .*$"
+    with pytest.raises(DelayRLError, match=words):
+        write_files(bundle, bundle_files(policy_of("bpql"), {"hyperparameters": "x" * (1 << 20)}), force=True)
+    assert {file.name: file.read_bytes() for file in bundle.iterdir()} == before
 
 
-def test_without_a_graph(bundle: Path) -> None:
-    document = json.loads((bundle / DOCUMENT).read_text())
-    rest = {k: v for k, v in document.items() if k not in ("files", "checksum")}
-    (bundle / DOCUMENT).write_bytes(seal(rest, {WEIGHTS: (bundle / WEIGHTS).read_bytes()})[DOCUMENT])
-    load_bundle(bundle)
-    refused(bundle, "holds no policy.onnx", "onnx")
+@pytest.mark.parametrize(
+    "idle", [None, 1.0, [], [1.0], [1.0, 2.0, 3.0], [1.0, "2"], [True, 0.0], [1e39, 0.0], [10**400, 0.0], {"0": 1.0}]
+)
+def test_an_idle_action_that_is_none(bundle: Path, idle: Any) -> None:
+    forge(bundle, lambda document: document.update(idle=idle))
+    assert load_bundle(bundle).idle is None
+    forge(bundle, lambda document: document.update(idle=[1, -0.5]))
+    assert load_bundle(bundle).idle.tolist() == [1, -0.5]
 
 
 @settings(max_examples=150, deadline=None, database=None)

@@ -53,7 +53,7 @@ def test_the_rehearsal(late: int, tmp_path: Path, monkeypatch, capsys) -> None:
     spec, push = Spec(4, 1, 3), np.full(1, 0.01, np.float32)  # so weak that the pole falls by itself
     policy = Policy(TINY["bpql"], random_state(TINY["bpql"], spec), spec, -push, push)
     monkeypatch.chdir(tmp_path)
-    bundle_of(tmp_path / "pendulum", policy, env=TASK, dt=0.04)
+    bundle_of(tmp_path / "pendulum", policy, env=TASK, dt=0.04, action_delay=1)  # which this plant does not have
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
     monkeypatch.setattr(sys, "argv", ["rehearse.py", str(late)])
     exec(compile(code, "rehearse.py", "exec"), {})

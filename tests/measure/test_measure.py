@@ -17,6 +17,7 @@ from gymnasium.wrappers import DelayObservation, StickyAction
 from delayrl import DelayRLError
 from delayrl.cli.console import seconds
 from delayrl.cli.main import main
+from delayrl.delays import as_delay
 from delayrl.envs import quiet
 from delayrl.measure import from_log, probe
 from delayrl.measure.log import rounded_up_steps
@@ -420,11 +421,19 @@ def test_a_delay_that_drifts_and_a_cold_start(tmp_path: Path) -> None:
     e = from_log(log(tmp_path / "log.csv", *signals("servo", lambda t: 3 + 3 * (t > 2100), 4000)))
     assert [round(d / ROW) for _, d in e.windows] == [3, 3, 3, 3, 6, 6, 6, 6]
     assert (e.train_with, e.in_step) == ("uniform:3:8", "uniform:3:6")
-    e.save(tmp_path / "steps.txt")
-    assert (tmp_path / "steps.txt").read_text().split() == ["3"] * 4 + ["6"] * 4
+    with pytest.raises(DelayRLError, match=r"only stamps give a delay of each step .* --delay uniform:3:8"):
+        e.save(tmp_path / "steps.txt")
     cold = signals("servo", lambda t: 20 - min(t, 100) // 6, 3000)
     e = from_log(log(tmp_path / "log.csv", *cold))
     assert (e.delay, e.in_step) == (pytest.approx(4 * ROW), "4")
+
+
+def test_two_parts_that_differ(tmp_path: Path) -> None:
+    """They count like the three and more of a longer log."""
+    u, y = signals("gain", lambda t: 3 + 4 * (t > 570), 1100, noise=0.05)
+    e = from_log(log(tmp_path / "log.csv", u, y))
+    assert [round(d / ROW) for _, d in e.windows] == [3, 7]
+    assert (e.train_with, e.in_step) == ("uniform:3:9", "uniform:3:7")
 
 
 def test_period_and_rounding(tmp_path: Path) -> None:
@@ -468,9 +477,96 @@ def test_a_sensor_slower_than_the_loop(every: int, tmp_path: Path) -> None:
     often = from_log(write(tmp_path / "often.csv", columns, rows))
     assert (often.row, often.rows, often.steps) == (once.row, once.rows, once.steps)
     loop = from_log(tmp_path / "often.csv", ROW)
-    assert loop.train_with == f"episode:2:{2 + every}"  # 50 ms, and up to a period of the sensor more
+    assert loop.train_with == f"uniform:2:{2 + every}"  # 50 ms, and up to a period of the sensor more
+    assert loop.in_step == f"uniform:3:{2 + every}"
     loop.save(str(tmp_path / "steps.txt"))
-    assert (tmp_path / "steps.txt").read_text().split() == ["3"] * loop.rows
+    ages = [str(2 + age) for age in range(every, 0, -1)]  # what is missing in a step comes with the next observation
+    assert (tmp_path / "steps.txt").read_text().split() == ["3", *ages * (loop.rows - 1)]
+
+
+def stamps(path: Path, made: np.ndarray, delay: np.ndarray | float) -> Path:
+    return write(path, {"stamp": made, "received": made + delay})
+
+
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_ages_of_a_saved_recording(every: int, tmp_path: Path) -> None:
+    """A sensor in step with the loop, a fifth lost, some overtaken: the recording shows the ages of the log."""
+    rng = np.random.default_rng(1)
+    made = ROW * every * np.arange(400)[rng.random(400) > 0.2 * (np.arange(400) > 0)]
+    delay = rng.choice([0.9, 1.5, 2.2, 4.8], len(made)) * ROW
+    e = from_log(stamps(tmp_path / "log.csv", made, delay), ROW, warm_up=0)
+    e.save(tmp_path / "steps.txt")
+    lines = np.array((tmp_path / "steps.txt").read_text().split(), int)
+    assert len(lines) > 300 * every
+    step, arrives = np.arange(len(lines)), np.arange(len(lines)) + lines  # as `Delayed` sends them, one each step
+    now = step[10 : -10 * every]
+    shown = [n - step[arrives <= n].max() for n in now]
+    logged = [n - round(made[made + delay < n * ROW + 1e-9].max() / ROW) for n in now]
+    assert shown == logged
+    low, high = min(logged), max(logged)
+    assert as_delay(e.in_step).observation.law.steps[0] == low
+    assert low + every < as_delay(e.in_step).maximum <= high
+    assert np.mean(np.array(logged) > as_delay(e.in_step).maximum) < 0.02
+
+
+def test_lost_observations_count(tmp_path: Path) -> None:
+    """20 ms, 41 to 45 ms late, a fifth lost: 99 % of the ages of a loop at any phase are in the range."""
+    rng = np.random.default_rng(0)
+    made = 0.02 * np.arange(3000)
+    delay = 0.041 + rng.uniform(0, 0.004, 3000)
+    whole = from_log(stamps(tmp_path / "whole.csv", made, delay), 0.02)
+    assert (whole.train_with, whole.in_step) == ("uniform:2:3", "3")
+    kept = rng.random(3000) > 0.2
+    made, arrived = made[kept], (made + delay)[kept]
+    e = from_log(stamps(tmp_path / "lost.csv", made, arrived - made), 0.02)
+    assert (e.train_with, e.in_step) == ("uniform:2:5", "uniform:3:5")
+    for phase in np.arange(0, 0.02, 0.004):
+        now = np.arange(100, 2900) * 0.02 + phase
+        ages = np.rint((now - made[np.searchsorted(arrived, now, "right") - 1]) / 0.02)
+        assert ages.min() >= 2
+        assert np.mean(ages > 5) < 0.01
+
+
+def test_constant_delays_of_which_some_are_lost_vary(tmp_path: Path) -> None:
+    made = ROW * np.delete(np.arange(600), np.arange(0, 600, 9))
+    e = from_log(stamps(tmp_path / "log.csv", made, 2.2 * ROW), ROW)
+    assert (e.train_with, e.in_step) == ("uniform:2:4", "uniform:3:4")
+
+
+def test_overtaken_observations_leave_the_older_in_use(tmp_path: Path) -> None:
+    """Every tenth takes 9 steps, longer than the next: it is never the newest, so the one before it ages by a step."""
+    delay = np.where(np.arange(600) % 10 == 0, 9.2, 2.2) * ROW
+    e = from_log(stamps(tmp_path / "log.csv", ROW * np.arange(600), delay), ROW)
+    assert (e.train_with, e.in_step) == ("uniform:2:4", "uniform:3:4")
+
+
+def test_a_pause_is_not_a_delay(tmp_path: Path) -> None:
+    """Two recordings in a file: nobody waited for an observation between them."""
+    made = ROW * np.arange(60) + 3600.0 * (np.arange(60) >= 30)
+    e = from_log(stamps(tmp_path / "log.csv", made, 2.2 * ROW), ROW)
+    assert e.train_with == "episode:2:3"
+    e.save(tmp_path / "steps.txt")
+    assert (tmp_path / "steps.txt").read_text().split() == ["3"] * e.rows
+
+
+@pytest.mark.parametrize("sensor", [0.01, 0.02, 0.05])
+def test_a_saved_recording_keeps_the_time(sensor: float, tmp_path: Path) -> None:
+    """Half a second of slow messages in every two are 25 lines of 20 ms, whatever the sensor's period."""
+    made = sensor * np.arange(round(40 / sensor))
+    delay = np.where(made % 2 < 0.5 - 1e-9, 0.16, 0.01)
+    e = from_log(stamps(tmp_path / "log.csv", made, delay), 0.02, warm_up=0)
+    e.save(tmp_path / "steps.txt")
+    steps = np.array((tmp_path / "steps.txt").read_text().split(), int)
+    assert abs(len(steps) - 2000) < 3
+    slow = (steps[80:1880] > 3).reshape(-1, 100)
+    assert np.abs(slow.sum(1) - 25).max() <= 8  # the last of them are overtaken
+
+
+@pytest.mark.parametrize(("period", "law"), [(0.01, "episode:2:3"), (0.02, "episode:2:3"), (0.06, "uniform:2:5")])
+def test_a_longer_period_of_the_sensor_is_jitter(period: float, law: str, tmp_path: Path) -> None:
+    """A loop of 20 ms with a sensor of 60 ms meets three ages in turn, at any phase."""
+    path = stamps(tmp_path / "log.csv", period * np.arange(400), 0.042)
+    assert from_log(path, 0.02).train_with == law
 
 
 def test_half_of_the_stamps(tmp_path: Path) -> None:
@@ -533,18 +629,30 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, saved = log(tmp_path / "log.csv", *signals("servo", 4)), tmp_path / "steps.txt"
-    main(["measure", str(path), "--period", "20ms", "--plot", str(tmp_path / "a.png"), "--save", str(saved)])
+    main(["measure", str(path), "--period", "20ms", "--plot", str(tmp_path / "a.png")])
     out = capsys.readouterr().out
-    recommended = ("train with: --delay episode:4:6", "or: --delay 4 ", f"or: --delay recorded:{saved}")
+    recommended = ("train with: --delay episode:4:6", "or: --delay 4 ")
     for words in ("dead time                 80 ms", *recommended):
         assert words in out
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    assert set(saved.read_text().split()) == {"4"}
+    assert "only stamps give a delay of each step" in refused(capsys, path, "--save", saved)
+    assert not saved.exists()
     main(["measure", str(path), "--period", "40ms", "--json"])
     result = json.loads(capsys.readouterr().out)
     assert (result["kind"], result["in_step"], result["step"]) == ("log", "2", 2)
     assert result["train_with"] == "episode:2:3"
     assert result["low"] <= result["delay"] <= result["high"]
+    path = stamps(tmp_path / "stamps.csv", TIME, 3.5 * ROW)
+    main(["measure", str(path), "--save", str(saved)])
+    out = capsys.readouterr().out
+    assert f"or: --delay recorded:{saved}" in out
+    assert "age when the next arrives 90 ms or less for 99 % of those in use" in out
+    assert set(saved.read_text().split()) == {"4"}
+    main(["measure", str(path), "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert (result["train_with"], result["in_step"], result["steps"]) == ("episode:3:4", "4", {"4": 380})
+    assert "replay" not in result
+    assert "No such file" in refused(capsys, path, "--save", tmp_path / "no" / "x.txt")
 
 
 def test_command_for_environments(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -636,7 +744,6 @@ def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("--stamp sent", "no column sent"),
         ("--episodes 3", "an option of an environment"),
         (f"--plot {tmp_path / 'x.tape'}", ".png"),
-        (f"--save {tmp_path / 'no' / 'x.txt'}", "No such file"),
     ):
         assert words in refused(capsys, path, *option.split())
 

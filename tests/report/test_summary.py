@@ -9,7 +9,7 @@ from synthetic import anchored, curve, row, small, standing
 
 from delayrl.errors import DelayRLError
 from delayrl.report.markdown import markdown
-from delayrl.report.page import page
+from delayrl.report.page import page, payload
 from delayrl.report.results import Place, Result, Setting
 from delayrl.report.summary import Summary, summarise
 from delayrl.run.cell import Progress
@@ -115,6 +115,44 @@ def test_delay_free_sac_of_another_protocol_preset_or_budget_is_no_anchor(change
     assert math.isnan(of(summary, "vdpo").reference_anchor.value)
 
 
+def test_the_threshold_alone_may_be_of_a_longer_reference() -> None:
+    """Where none has as many steps: the longest of the plain ones. Returns are not normalised by it."""
+    cells = small()
+    cells["sac"] = standing("sac", "delayrl/Ant-v4", 0, 2, id="4", steps=400, overrides={"steps": 400})
+    more = {
+        "5": standing("sac", "delayrl/Ant-v4", 0, 2, id="5", steps=500, overrides={"steps": 500}),
+        "6": standing("sac", "delayrl/Ant-v4", 0, 2, id="6", steps=600, overrides={"steps": 600, "discount": 0.9}),
+        "7": standing("sac", "delayrl/Ant-v4", 0, 2, id="7", state="running", step=500, steps=700),
+        "official": standing("sac", "delayrl/Ant-v4", 0, 2, id="8", steps=800, protocol="official"),
+    }
+    given = {
+        "vdpo": [[0.0, 0, 99], [0.0, 0, 120]],
+        "sac": [[60.0] * 4] * 2,
+        "5": [[25.0] * 5, [35.0] * 5],
+        "6": [[70.0] * 6] * 2,
+        "7": [[80.0] * 5] * 2,
+        "official": [[90.0] * 8] * 2,
+    }
+    summary = summarise(anchored(cells | more, **given), [*cells.values(), *more.values()])
+    result = of(summary, "vdpo")
+    assert (result.threshold, result.steps_to_threshold, result.missed) == (30, 300, False)
+    assert result.steps_interval == (300, math.inf)
+    assert math.isnan(result.reference_anchor.value)
+    assert np.isnan([*result.final, *result.area, *result.final_interval]).all()
+    (steps,) = [table for table in summary.tables if table.kind == "steps"]
+    assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].note == "2/2 seeds · reference of 500 steps"
+    (shown,) = [a["threshold"] for a in payload(summary, "t")["anchors"] if (a["setting"], a["total"]) == (0, 300)]
+    assert shown == "30.0 ± 7.1 (sac steps=500, no delay, 500 steps)"
+    equal = small()["sac"]
+    both = summarise(
+        anchored(cells | more | {"equal": equal}, **given, equal=[[0.0, 0, 90]] * 2),
+        [*cells.values(), *more.values(), equal],
+    )
+    assert of(both, "vdpo").threshold == 30  # (0 + 0 + 90) / 3, of that with the same steps
+    assert of(both, "vdpo").reference_anchor.value == 90
+    assert of(both, "vdpo").threshold_anchor == of(both, "vdpo").reference_anchor
+
+
 def test_a_reference_that_is_worse_than_random_normalises_nothing() -> None:
     cells = small()
     curves = anchored(cells, sac=[[0.0, 0, 5], [0.0, 0, 5]], vdpo=[[0.0, 0, 50], [0.0, 0, 50]])
@@ -159,7 +197,12 @@ def test_a_run_that_goes_on_is_not_compared_as_if_it_had_ended() -> None:
     assert not summary.aggregates
     entry = summary.tables[1].entries["delayrl/Ant-v4", 5, "vdpo"]
     assert not entry.missed  # it may yet get there
+    assert np.isnan(entry.interval).all()
     assert "at 200 of 300 steps" in entry.note
+    early = summarise(anchored(cells, vdpo=[[0.0, 100], [0.0, 900]], sac=[[0.0, 0, 240]] * 2), [*cells.values()])
+    assert (of(early, "vdpo").threshold, of(early, "vdpo").steps_to_threshold) == (80, 200)
+    assert np.isnan(of(early, "vdpo").steps_interval).all()  # one of its seeds alone has not reached it: no × yet
+    assert "to ×" not in markdown(early, "t", {})
     assert "at 200 of 300 steps" in markdown(summary, "t", {})
     ended = small()
     summary = summarise(anchored(ended, vdpo=[[0.0, 1, 2], [0.0, 1, 2]]), [*ended.values()])

@@ -4,10 +4,13 @@ import math
 from typing import Any
 
 import pytest
-from synthetic import rows, small, standing
+from synthetic import row, rows, small, standing
 
+from delayrl.bench.grid import load_grid
+from delayrl.report.markdown import markdown
 from delayrl.report.summary import summarise
 from delayrl.report.tables import published_values
+from delayrl.run.cell import Progress
 from delayrl.run.condition import resolve
 from delayrl.run.rows import CONFIGURATION
 
@@ -86,6 +89,32 @@ def test_stochastic_delays_have_their_table() -> None:
     assert table.kind == "stochastic"
     assert table.entries["delayrl/Walker2d-v4", "paper-stochastic-5", "vdpo"].published.table == "4"  # type: ignore[union-attr]
     assert table.entries["X", "walk:8", "bpql"].published is None
+
+
+def test_the_papers_row_shows_its_number() -> None:
+    """Steps to the delay-free return under both protocols, from a reference that is longer than every learner."""
+    cells = [(cell, Progress("done", cell.condition.steps)) for cell in load_grid("evidence-1-paper").cells]
+    every = [
+        row(cell, seed, step, {"sac": 100.0, "random": 0.0}.get(condition.agent, 300 * step / condition.steps))
+        for cell in cells
+        for condition in [cell[0].condition]
+        for seed in cell[0].seeds
+        for step in range(condition.steps // 10, condition.steps + 1, condition.steps // 10)
+    ]
+    summary = summarise(every, cells)
+    tables = [table for table in summary.tables if table.kind == "steps"]
+    assert {table.setting.protocol for table in tables} == {"corrected", "official"}
+    for table in tables:
+        (entries,) = [[table.entries[at, delay, label] for label in table.columns] for at, delay in table.rows]
+        reached = {label: entry.value for label, entry in zip(table.columns, entries, strict=True)}
+        late = {"vdpo": 36_000, "ad-sac": 36_000, "dcac": 36_000, "dida": 120_000, "a-sac": 120_000, "bpql": 180_000}
+        assert reached == late  # the mean of five evaluations up to six tenths of the steps: 300 × 0.4 is above 100
+        assert all("reference of 1,000,000 steps" in entry.note for entry in entries)
+        assert {entry.published for entry in entries} == {None}  # they are not as long as the paper's
+    text = markdown(summary, "t", {})
+    threshold = "100.0 ± 0.0 (sac, no delay, 1,000,000 steps)"
+    assert text.count(f"| delayrl/Pusher-v4 | 60,000 | 0.00 ± 0.00 (3 seeds) | none |  | {threshold} |") == 2
+    assert "and its steps are noted" in text
 
 
 def test_published_values() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import DelayObservation, RecordEpisodeStatistics
+from gymnasium.wrappers import Autoreset, DelayObservation, RecordEpisodeStatistics, TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -272,7 +272,7 @@ def test_vector_streams_and_refusals() -> None:
     env.reset(seed=1)
     ages = np.array([env.step(env.action_space.sample())[4]["age"] for _ in range(40)])
     assert len({tuple(column) for column in ages.T}) == 4
-    with pytest.raises(delayrl.DelayRLError, match="inside"):
+    with pytest.raises(delayrl.DelayRLError, match="all environments step together: give the whole delay inside"):
         DelayedVector(vector(None, "Pendulum-v1"), "2+reward=3")
     with pytest.raises(delayrl.DelayRLError, match="continuous"):
         DelayedVector(vector(None, "CartPole-v1"), 2)
@@ -348,6 +348,30 @@ def test_the_time_limit_is_not_late() -> None:
         ends.append((terminated, truncated))
     assert ends[-2:] == [(False, False), (True, True)]
     assert sum(rewards) == 2.0**9 - 1
+
+
+def test_a_time_limit_goes_inside() -> None:
+    """Around delayed rewards it would lose those on their way; inside, the same return comes as without a delay."""
+    for layers in (TimeLimit, lambda env, steps: RecordEpisodeStatistics(TimeLimit(env, steps))):
+        with pytest.raises(delayrl.DelayRLError, match="put TimeLimit inside Delayed"):
+            AugmentedObservation(layers(Delayed(Journal(20), "2+reward=3"), 10))
+    AugmentedObservation(TimeLimit(Delayed(Journal(20), "2+action=1"), 10))
+    env = AugmentedObservation(Delayed(TimeLimit(Journal(20), 10), "2+reward=3"))
+    env.reset(seed=0)
+    outcomes = [env.step(np.float32([0]))[1:4] for _ in range(10)]
+    assert outcomes[-1][1:] == (False, True)
+    assert sum(reward for reward, *_ in outcomes) == 2.0**10 - 1
+
+
+def test_an_environment_that_resets_itself_is_refused() -> None:
+    """Its new episode would show what was still on its way in the old one."""
+    for env in (Autoreset(Journal(5)), RecordEpisodeStatistics(Autoreset(Journal(5)))):
+        with pytest.raises(delayrl.DelayRLError, match=r"carry .* the next episode: .* Autoreset\(Delayed\("):
+            Delayed(env, 3)
+    env = Autoreset(Delayed(Journal(5), 3))
+    env.reset(seed=0)
+    seen = [(obs[0], info["age"]) for obs, *_, info in (env.step(np.float32([0])) for _ in range(8))]
+    assert seen == [(0, 1), (0, 2), (0, 3), (1, 3), (2, 3), (0, 0), (0, 1), (0, 2)]
 
 
 def test_the_info_of_the_last_step_is_not_repeated() -> None:
@@ -496,10 +520,10 @@ def test_one_delay_is_enough() -> None:
         Delayed(AugmentedObservation(Delayed(Journal(5), 1)), 2)
     with pytest.raises(delayrl.DelayRLError, match="takes a vector"):
         DelayedVector(Journal(5), 2)  # type: ignore[arg-type]
-    late, rewarded = (vectors(lambda d=d: Delayed(Journal(5), d)) for d in ("2", "reward=1"))
-    with pytest.raises(delayrl.DelayRLError, match="delayed already"):
-        DelayedVector(late, 2)
-    assert DelayedVector(rewarded, 2).delay == as_delay(2)
+    for inside in ("2", "action=1", "reward=1", "uniform:0:2+reward=uniform:0:3"):
+        with pytest.raises(delayrl.DelayRLError, match=r"delayed already: .* the whole delay inside"):
+            DelayedVector(vectors(lambda d=inside: Delayed(Journal(5), d)), 2)
+    assert DelayedVector(vectors(lambda: Delayed(Journal(5), 0)), 2).delay == as_delay(2)
 
 
 def vectors(make: Any, **options: Any) -> Any:
@@ -507,6 +531,23 @@ def vectors(make: Any, **options: Any) -> Any:
     from gymnasium.vector import SyncVectorEnv
 
     return SyncVectorEnv([make] * 2, **options)
+
+
+def test_an_inner_wrapper_without_a_delay_is_not_seen() -> None:
+    """Through the end of an episode, where both wrappers have an `info` of their own."""
+    made = [
+        vectors(lambda d=d: Delayed(Journal(4), 0) if d else Journal(4), autoreset_mode="SameStep")
+        for d in (True, False)
+    ]
+    inside, plain = (AugmentedVectorObservation(DelayedVector(env, "uniform:0:3+action=1")) for env in made)
+    for env in (inside, plain):
+        env.reset(seed=2)
+    for step in range(1, 10):
+        (ours, *_, infos), (want, *_, wanted) = (env.step(np.full((2, 1), 0.1 * step)) for env in (inside, plain))
+        np.testing.assert_array_equal(ours, want)
+        assert ("final_info" in infos) == (step % 4 == 0)
+        for name in wanted.get("final_info", ()):
+            np.testing.assert_array_equal(infos["final_info"][name], wanted["final_info"][name])
 
 
 class Numeric(gym.vector.VectorWrapper):

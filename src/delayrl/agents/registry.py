@@ -52,19 +52,13 @@ _VDPO = replace(
 _BPQL = replace(OFFICIAL, opening="zeros", evaluation_opening="zeros", opening_steps="dropped")
 """BPQL's released code, on which that of policy lifting is built."""
 _SMALL = Schedule(steps=15_000, random_steps=1_000, replay_capacity=20_000, evaluate_every=2_500)
-
-
 _PAPER = Schedule()
 _MATCHED = Schedule(steps=100_000, random_steps=5_000, replay_capacity=200_000, evaluate_every=5_000)
 
 
 def _presets(paper: Agent, matched: Agent, small: Agent, schedule: Schedule = _PAPER) -> dict[str, Preset]:
     """Return the paper's hyperparameters, those for comparing methods, and small ones that train in minutes."""
-    return {
-        "paper": Preset(paper, schedule),
-        "matched": Preset(matched, _MATCHED),
-        "small": Preset(small, _SMALL),
-    }
+    return {"paper": Preset(paper, schedule), "matched": Preset(matched, _MATCHED), "small": Preset(small, _SMALL)}
 
 
 def _soft(summary: str, paper: str, **sees: str) -> Registration:
@@ -76,7 +70,7 @@ def _soft(summary: str, paper: str, **sees: str) -> Registration:
 _MATCHED_SAC = SAC(entropy_unit="scaled")
 """VDPO's SAC, with entropies over [-1, 1]: the preset `matched` builds every agent on it (docs/decisions.md)."""
 _MATCHED_BPQL = replace(_MATCHED_SAC, actor_sees="augmented")
-_MATCHED_ADSAC = replace(_MATCHED_BPQL, critic_sees="augmented", actor_updates=4)  # two for each of its two actors
+_MATCHED_ADSAC = ADSAC(replace(_MATCHED_BPQL, critic_sees="augmented", actor_updates=4), temperature_every=2)
 _MATCHED_VDPO = VDPO(_MATCHED_SAC, width=64, layers=2, dropout=0.0, clone_every=1, clone_updates=1)
 _MATCHED_DIDA = DIDA(
     _MATCHED_SAC,
@@ -120,9 +114,7 @@ AGENTS: dict[str, Registration] = {
     "ad-sac": Registration(
         "learns values for a shorter delay, and improves the actor of the long one by them",
         "Wu et al., ICML 2024",
-        _presets(
-            ADSAC(), ADSAC(_MATCHED_ADSAC, temperature_every=2), ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))
-        ),
+        _presets(ADSAC(), _MATCHED_ADSAC, ADSAC(replace(_SMALL_BPQL, critic_sees="augmented"))),
         replace(
             _VDPO,
             start_states="own",

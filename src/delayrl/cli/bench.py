@@ -20,6 +20,8 @@ BACKEND_OPTIONS: dict[str, dict[str, Any]] = {
     "ray": {"address": None, "cpus": 1.0, "gpus": 0.0},
 }
 """Defaults of the options that only one backend has."""
+SQLITE = b"SQLite format 3\x00"
+"""How a SQLite file begins."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     def add_command(name: str, text: str) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
-        table = ", a table that `collect` wrote (.sqlite)" if name == "report" else ""
+        table = ", a table that `collect` wrote" if name == "report" else ""
         command.add_argument("grid", metavar="GRID", help=f"a .toml file{table}, or one of {', '.join(shipped())}")
         command.add_argument("--runs", type=Path, default="runs/bench", help="the cells' folder (default: runs/bench)")
         return command
@@ -60,13 +62,24 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace) -> None:
     """Run a command on a grid."""
-    if given.action == "report" and given.grid.endswith(".sqlite"):
+    if given.action == "report" and _is_table(given.grid):
         _report(None, given)
         return
     grid = load_grid(given.grid)
     if given.action != "plan":
         folders.claim(given.runs, grid, check_only=True)
     {"plan": _plan, "run": _run, "status": _status, "collect": _collect, "report": _report}[given.action](grid, given)
+
+
+def _is_table(grid: str) -> bool:
+    """Tell whether the argument is a table. `collect --out` gives it any name, so its first bytes count."""
+    if grid in shipped():
+        return False
+    try:
+        with open(grid, "rb") as file:
+            return file.read(len(SQLITE)) == SQLITE or grid.endswith(".sqlite")
+    except OSError:
+        return grid.endswith(".sqlite")  # reading it says what is wrong
 
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:

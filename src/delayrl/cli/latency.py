@@ -21,15 +21,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Time the decisions, and print their quantiles."""
     from delayrl.deploy.bundle import BACKENDS, load_bundle
-    from delayrl.deploy.files import GRAPH
     from delayrl.deploy.latency import available, latency, table
 
     policy = load_bundle(given.bundle)
     period = policy.dt if given.period is None else given.period
     if given.period is not None and not 0 < given.period < math.inf:
         raise DelayRLError(f"--period must be above 0; got {given.period:g} s")
-    here = [name for name in BACKENDS if available(name) and (name != "onnx" or GRAPH in policy.metadata["files"])]
-    backends = [given.backend] if given.backend else here
+    backends = [given.backend] if given.backend else [name for name in BACKENDS if available(name)]
     rows = {name: latency(given.bundle, name, decisions=given.decisions, ages=given.ages) for name in backends}
     print_table(*table(rows, period))
     note = f"control period {1000 * period:g} ms" if period else "control period unknown: give --period TIME"

@@ -47,7 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     words = "time to leave out at the start (default: a twentieth of the log)"
     add("--warm-up", type=seconds, metavar="TIME", help=words)
     add("--plot", type=Path, metavar="FILE", help="plot the result as .png, .svg or .pdf")
-    add("--save", type=Path, metavar="FILE", help="write the delays in steps, for --delay recorded:FILE")
+    add("--save", type=Path, metavar="FILE", help="write a delay of each step, for --delay recorded:FILE (with stamps)")
 
 
 def run(given: argparse.Namespace) -> None:
@@ -59,10 +59,10 @@ def run(given: argparse.Namespace) -> None:
             raise DelayRLError(f"--longest is a time such as 200ms in a log; got {given.longest}")
         options = {name: getattr(given, name) for name in (*COLUMNS, "period", "longest", "warm_up", "seed")}
         result = from_log(given.target, **options, unit=given.unit or "s")
-        if given.plot:
-            plot(result, given.plot)
         if given.save:
             result.save(given.save)
+        if given.plot:
+            plot(result, given.plot)
         print(json.dumps(result.json()) if given.json else _show_log(result, given.save))
         return
     _refuse(given, ("period", *COLUMNS, "unit", "warm_up", "plot", "save"), "a log", "an environment")
@@ -133,6 +133,7 @@ def _show_stamps(e: Estimated) -> list[str]:
     lines = [f"delay (received - stamp)  {_ms(e.delay)} median, {spread}", f"{'':<26}{_ms(e.longest)} at worst"]
     if e.slowest_warm_up is not None:
         lines.append(f"{'during the warm-up':<26}{_ms(e.slowest_warm_up)} at worst; not counted")
+    lines.append(f"{'age when the next arrives':<26}{_ms(e.span[1])} or less for 99 % of those in use")
     lines.append(f"{'in steps of ' + _ms(e.period):<26}" + _shares(e.counts))
     note = "Exact if one clock gave both stamps: an offset between two clocks is in every delay, and cannot be seen."
     lines.append(note)

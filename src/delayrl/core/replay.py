@@ -64,8 +64,7 @@ def current_moment(replay: Replay) -> Int[Array, ""]:
 
 def drawable(replay: Replay, hidden: Int[Array, ""] | int, learnable: Learnable = ALL) -> Int[Array, ""]:
     """Return how many steps have arrived that can be sampled: all but those among the `hidden` newest steps."""
-    of_episode = current_moment(replay) - (learnable.first + learnable.until_end - 1)  # those of the current episode
-    return replay.steps - jnp.minimum(hidden, jnp.maximum(of_episode, 0))
+    return replay.steps - jnp.clip(current_moment(replay) - learnable.first - learnable.until_end + 1, 0, hidden)
 
 
 def append(
@@ -103,16 +102,9 @@ def append(
 
 
 def sample(
-    replay: Replay,
-    key: Key,
-    batch: int,
-    delay: int,
-    ahead: int,
-    hidden: Int[Array, ""],
-    log_scale: float = 0.0,
-    learnable: Learnable = ALL,
+    replay: Replay, key: Key, batch: int, delay: int, ahead: int, hidden: Int[Array, ""], learnable: Learnable = ALL
 ) -> Window:
-    """Sample windows around uniformly drawn steps. No window crosses the boundary of an episode.
+    """Sample windows [batch] around uniformly drawn steps. No window crosses the boundary of an episode.
 
     Args:
         replay: a ring with at least one step whose outcome has arrived.
@@ -121,11 +113,7 @@ def sample(
         delay: Δ, the number of rows before the step.
         ahead: number of rows after the step, which is the longest k of a k-step target.
         hidden: number of newest observations that have not arrived yet: the learner's age, 0 if it may see them all.
-        log_scale: of the task's actions, which the windows carry.
         learnable: as for `append`.
-
-    Returns:
-        Windows with a leading axis `batch`.
     """
     capacity = replay.obs.shape[0]
     pick, length = jax.random.split(key)
@@ -155,5 +143,4 @@ def sample(
         lead=lead,
         n_step=jnp.minimum(drawn, lead),
         delay=delay,
-        log_scale=log_scale,
     )

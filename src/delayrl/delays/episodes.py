@@ -8,6 +8,7 @@ import numpy as np
 
 from delayrl.delays.laws import DelayLaw, uniform
 from delayrl.delays.own import own_law
+from delayrl.delays.recordings import next_whole
 from delayrl.errors import DelayRLError
 
 
@@ -84,8 +85,8 @@ def any_phase(shortest: float, longest: float, period: float = 1.0) -> tuple[int
     """
     if not 0 <= shortest <= longest < math.inf:
         raise DelayRLError(f"a delay and its jitter are finite and not negative; got {shortest:g} to {longest:g} steps")
-    # half a step is rounded towards the younger age; a millionth of a step is rounding error
-    return max(0, math.ceil(shortest - 0.5 - 1e-6)), math.ceil(longest + period - 0.5 - 1e-6)
+    # half a step is rounded towards the younger age
+    return max(0, next_whole(shortest - 0.5)), next_whole(longest + period - 0.5)
 
 
 def unsynchronised(delay: float, jitter: float = 0.0) -> DelayLaw:

@@ -14,13 +14,14 @@ def recorded(path: str | Path, step_seconds: float | None = None, unit: str = ""
     """Read measured delays from a file.
 
     Args:
-        path: a .npy file, or a text file with one number per line. Of several columns the last one counts, and a text
-            file may start with a header.
+        path: a .npy file, or a text file with one number per line. A text file may start with a header. Of several
+            columns the last one counts; those of a text file need a header, because 54,3 may be one number.
         step_seconds: the length of an environment step, needed if `unit` is a time.
         unit: "" for whole steps; "s" or "ms" for times, which are rounded up to whole steps.
 
     Raises:
-        DelayRLError: a missing or empty file, or a value that is not a finite number of at least 0.
+        DelayRLError: a missing or empty file, several columns without a header, or a value that is not a finite number
+            of at least 0.
     """
     path = Path(path).expanduser()
     try:
@@ -57,8 +58,14 @@ def _cells(path: Path) -> list[tuple[str, str]]:
         column = array if array.ndim < 2 else array[:, -1]
         return [(f"entry {i}", repr(value)) for i, value in enumerate(np.atleast_1d(column).astype(float).tolist())]
     lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
-    cells = [(f"line {i}", line.split(",")[-1].strip().strip('"')) for i, line in lines if line.strip()]
+    rows = [(f"line {i}", line.split(",")) for i, line in lines if line.strip()]
+    cells = [(place, row[-1].strip().strip('"')) for place, row in rows]
     has_header = bool(cells) and not is_number(cells[0][1])
+    columns = len(rows[0][1]) if has_header else 1
+    for place, row in rows:
+        if len(row) > columns:
+            line = f"{path}, {place}: several columns and no header, or decimal commas"
+            raise DelayRLError(f"{line}; write one number a line, such as 54.3, or name the columns in the first line")
     return cells[1:] if has_header else cells
 
 
@@ -75,12 +82,16 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds
 
 
+def next_whole(steps: float) -> int:
+    """Round up to a whole number. Less than a millionth part above one is the rounding error of a step's length."""
+    return math.ceil(steps - 1e-6 * max(1.0, steps))
+
+
 def rounded_up(steps: float) -> int:
     """Round a delay up to whole steps: a message that arrives between two steps is seen at the later one."""
     if not math.isfinite(steps):
         raise DelayRLError(f"a delay must be finite; got {steps:g} steps")
-    # a millionth of a step is rounding error
-    return whole_steps(math.ceil(steps - 1e-6) if steps > 0 else math.floor(steps))
+    return whole_steps(next_whole(steps) if steps > 0 else math.floor(steps))
 
 
 def is_number(text: str) -> bool:

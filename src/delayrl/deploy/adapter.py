@@ -12,6 +12,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import (
+    HumanRendering,
+    NormalizeReward,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    RecordEpisodeStatistics,
+    RecordVideo,
+    TimeLimit,
+)
 from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.backends.network import Network
@@ -24,6 +33,10 @@ from delayrl.wrappers.single import find_delayed, name_of
 
 SAMPLES, TOLERANCE = 200, 1e-4
 """Inputs on which layers are compared with the policy that they are of, and their largest error, of the range."""
+HARMLESS: tuple[Any, ...] = (gym.Wrapper, AugmentedObservation, NormalizeReward, TimeLimit, OrderEnforcing)
+HARMLESS += (PassiveEnvChecker, RecordEpisodeStatistics, RecordVideo, HumanRendering)
+MONITOR = "stable_baselines3.common.monitor.Monitor"
+"""Classes whose `step` and `reset` pass observations and actions on as they are, and one more by its name."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +51,7 @@ class AdaptedPolicy:
     max_age: int  # Δ, in steps
     dt: float | None  # seconds a step; None if unknown
     action_delay: int  # the part of the ages that actions take to act
+    idle: NDArray[Any]  # what acts before the first command, [A]
 
     def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
         """Return the function's action, [A]."""
@@ -53,7 +67,7 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         env: the environment, with its `Delayed`; it is not played.
 
     Raises:
-        DelayRLError: no `Delayed` in it, a wrapper outside of it that changes observations or actions, or a random
+        DelayRLError: no `Delayed` in it, a wrapper outside of it that may change observations or actions, or a random
             delay of the actions.
     """
     delayed, augmented = _layers_of(env)
@@ -74,6 +88,7 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         history,
         delayed.step_seconds,
         delay.action.maximum,
+        delayed._transit._idle,
     )
 
 
@@ -86,14 +101,18 @@ def _layers_of(env: Any) -> tuple[Delayed, AugmentedObservation | None]:
     while layer is not delayed:
         if isinstance(layer, AugmentedObservation):
             augmented = layer
-        elif isinstance(layer, gym.ObservationWrapper | gym.ActionWrapper):
+        if not _keeps_all(layer):
             name = type(layer).__name__
             raise DelayRLError(f"{name} stands outside Delayed, where no controller runs it: put it inside")
         layer = layer.env
-    inner = delayed if augmented is None else augmented
-    if (env.observation_space, env.action_space) != (inner.observation_space, delayed.action_space):
-        raise DelayRLError(f"wrappers outside {type(inner).__name__} change what the policy sees: put them inside")
     return delayed, augmented
+
+
+def _keeps_all(layer: Any) -> bool:
+    """Whether a wrapper is known to pass observations and actions on as they are."""
+    owners = [next(kind for kind in type(layer).__mro__ if name in vars(kind)) for name in ("step", "reset")]
+    known = (kind in HARMLESS or f"{kind.__module__}.{kind.__qualname__}" == MONITOR for kind in owners)
+    return isinstance(layer, gym.RewardWrapper) or all(known)
 
 
 def export_layers(
@@ -150,6 +169,7 @@ def export_layers(
         "delay": delayed.delay.acted().label(),
         "ages": [0, delta],
         "action_delay": policy.action_delay,
+        "idle": [float(x) for x in policy.idle],
         "dt": policy.dt,
         "observation": described(delayed.observation_space),
         "action": described(delayed.action_space),

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.backends.network import Act, Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
-from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, read_files
+from delayrl.deploy.files import WEIGHTS, check_files, read_files
 from delayrl.deploy.runtime.episode import LONGEST_STEP, SHORTEST_STEP
 from delayrl.errors import DelayRLError
 
@@ -26,6 +26,7 @@ class Bundle:
         min_age, max_age: the ages that it was trained for, in steps; max_age is Δ.
         dt: seconds between two decisions; None if the task does not say.
         action_delay: the longest delay of actions in training, in steps, which is part of the age; 0 if unknown.
+        idle: what acted in training before the first command, [A]; None if unknown.
         metadata: the content of bundle.json.
         backend: "numpy", "onnx" or "jax".
     """
@@ -39,6 +40,7 @@ class Bundle:
         self.dt = float(dt) if type(dt) in (int, float) and SHORTEST_STEP <= dt <= LONGEST_STEP else None
         lag: Any = metadata.get("action_delay")
         self.action_delay = lag if type(lag) is int and 0 <= lag <= network.max_age else 0
+        self.idle = _idle(metadata.get("idle"), network.action_size)
 
     def __call__(self, obs: ArrayLike, actions: ArrayLike, age: int) -> NDArray[np.float32]:
         """Compute the deterministic action. Calls do not depend on each other.
@@ -85,27 +87,29 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
 
     Args:
         path: the folder of the bundle.
-        backend: "numpy"; "onnx", which runs policy.onnx with onnxruntime (extra `deploy`); or "jax".
+        backend: "numpy"; "onnx", which runs a graph of the weights with onnxruntime (extra `deploy`); or "jax".
+            None of them reads policy.onnx.
 
     Raises:
         DelayRLError: no bundle, a damaged or foreign one, or a backend that is not installed.
     """
     if backend not in BACKENDS:
         raise DelayRLError(f"unknown backend {backend!r}; there are {', '.join(BACKENDS)}")
-    metadata, files = read_files(path, (WEIGHTS, GRAPH) if backend == "onnx" else (WEIGHTS,))
+    metadata, files = read_files(path, (WEIGHTS,))
     network, arrays = check_files(path, metadata, files)
-    act = numpy_policy(network, arrays)
     if backend == "jax":
-        from delayrl.deploy.backends.jax_policy import jax_policy
+        from delayrl.deploy.backends.jax_policy import jax_policy as policy
+    elif backend == "onnx":
+        from delayrl.deploy.backends.onnx_policy import onnx_policy as policy
+    else:
+        policy = numpy_policy
+    return Bundle(network, metadata, policy(network, arrays), backend)
 
-        act = jax_policy(network, arrays)
-    if backend == "onnx":
-        from delayrl.deploy.backends.onnx_policy import onnx_policy
 
-        if GRAPH not in files:
-            raise DelayRLError(f"{path} holds no {GRAPH}")
-        try:
-            act = onnx_policy(network, files[GRAPH], act)
-        except DelayRLError as error:
-            raise DelayRLError(f"{Path(path) / GRAPH} cannot be used: {error}") from error
-    return Bundle(network, metadata, act, backend)
+def _idle(given: Any, size: int) -> NDArray[np.float32] | None:
+    """Return the idle action in a bundle.json; None if it has none, or something else."""
+    if not isinstance(given, list) or len(given) != size:
+        return None
+    largest = float(np.finfo(np.float32).max)
+    valid = all(type(x) in (int, float) and abs(x) <= largest for x in given)
+    return np.asarray(given, np.float32) if valid else None

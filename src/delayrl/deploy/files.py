@@ -3,7 +3,7 @@
 ```
 bundle.json          network, task, delay, evaluation; sizes and SHA-256 of the files below; its own checksum
 policy.safetensors   the weights
-policy.onnx          the same policy as a graph (optional)
+policy.onnx          the same policy as a graph, for other runtimes (optional); we never run it
 ```
 
 A bundle may come from anybody. Only these names are read, and only as regular files. Nothing is used before its size
@@ -75,11 +75,19 @@ def check_files(path: str | Path, metadata: dict[str, Any], files: Mapping[str, 
 
 
 def seal(metadata: Mapping[str, Any], files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Return the files with a bundle.json added: the metadata, their sizes and checksums, and its own checksum."""
+    """Return the files with a bundle.json added: the metadata, their sizes and checksums, and its own checksum.
+
+    Raises DelayRLError if a file is larger than `read_files` reads.
+    """
     document = {"format": FORMAT, **metadata}
     document["files"] = {name: {"bytes": len(data), "sha256": sha256(data).hexdigest()} for name, data in files.items()}
     document["checksum"] = checksum(document)
-    return {DOCUMENT: json.dumps(document, indent=1, allow_nan=False).encode() + b"\n", **files}
+    content = {DOCUMENT: json.dumps(document, indent=1, allow_nan=False).encode() + b"\n", **files}
+    for name, data in content.items():
+        if len(data) > LIMITS[name]:
+            allowed = f"a bundle allows {LIMITS[name]:,}: use fewer observations or smaller networks"
+            raise DelayRLError(f"{name} would have {len(data):,} bytes, {allowed}")
+    return content
 
 
 def checksum(document: Mapping[str, Any]) -> str:

@@ -84,7 +84,8 @@ def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | Non
 
 def available(backend: str) -> bool:
     """Whether the packages of a backend are installed."""
-    return find_spec({"numpy": "numpy", "onnx": "onnxruntime", "jax": "jax"}[backend]) is not None
+    packages = ("onnx", "onnxruntime") if backend == "onnx" else (backend,)
+    return all(find_spec(name) is not None for name in packages)
 
 
 def table(rows: dict[str, list[dict[str, Any]]], period: float | None) -> tuple[list[str], list[list[str]]]:

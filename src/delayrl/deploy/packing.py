@@ -16,7 +16,8 @@ from delayrl.errors import DelayWarning
 def pack(network: Network, arrays: Arrays, metadata: dict[str, Any]) -> dict[str, bytes]:
     """Return the files of a bundle: the weights, the graph, and a bundle.json of `metadata` and the network.
 
-    Without the package `onnx` the graph is left out, with a DelayWarning that says so.
+    Without the package `onnx` the graph is left out, with a DelayWarning that says so. Raises DelayRLError if a file is
+    larger than a bundle allows.
     """
     metadata = metadata | {"policy": network.document()}
     weights = safetensors.numpy.save(dict(sorted(arrays.items())))

@@ -10,10 +10,10 @@ import numpy as np
 
 from delayrl.delays import PerEpisode, any_phase, uniform
 from delayrl.errors import DelayRLError
-from delayrl.measure import correlate, reading
+from delayrl.measure import ages, correlate, reading
+from delayrl.measure.ages import TOLERANCE, rounded_up_steps
 from delayrl.measure.correlate import Array
 
-TOLERANCE = 1e-3  # of a step: a smaller excess over whole steps is not rounded up
 BLOCKS = 40
 RESAMPLINGS = 200
 LEAST_ROWS = 200
@@ -53,10 +53,12 @@ class Estimated:
     steps: tuple[int, ...]  # the delay of each window or observation, in steps, in order of time
     step: int  # `delay` in steps
     span: tuple[float, float]  # the shortest and the longest delay to train for, in seconds; see `train_with`
+    step_span: tuple[int, int]  # the same for a sensor in step with the loop, in steps; see `in_step`
     strength: float | None = None  # of the strongest lag; chance reaches 1 in one of a thousand logs
     peak: Pair | None = None  # largest correlation of increments; its lag includes the plant's own lag
     pairs: tuple[Pair, ...] = ()  # the strongest pairs
     windows: tuple[tuple[float, float], ...] = ()  # (middle in seconds, dead time) of each part that shows one
+    replay: tuple[tuple[int, int], ...] = ()  # stamps only: what `save` writes, see `ages.replay`
     longest: float = 0.0  # the largest delay of a window or an observation, in seconds
     slowest_warm_up: float | None = None  # stamps only: the largest delay during the warm-up, in seconds
     drift: float | None = None  # stamps only: growth of the smallest delays, in parts per million: clocks run apart
@@ -66,30 +68,28 @@ class Estimated:
     def train_with(self) -> str:
         """The argument for `delayrl train --delay`, for a sensor at any phase of the control loop.
 
-        With stamps it covers the smallest delay to the 99th percentile, for a sensor with the period that the stamps
-        have. By correlation it covers the dead time, which is known to a row, or the 10th to the 90th percentile of
-        windows that differ, for a sensor with the period of the loop. The law is of each episode, or of each message
-        if the delays vary.
+        With stamps it covers the smallest delay to the 99th percentile of the ages that observations reach before the
+        next one arrives, so lost ones count. By correlation it covers the dead time, which is known to a row, or the
+        10th to the 90th percentile of windows that differ, for a sensor with the period of the loop. The law is of each
+        episode, or of each message if ages vary within one.
         """
         stamped, (low, high) = self.method == "stamps", np.array(self.span) / self.period
-        youngest, oldest = any_phase(low, high, self.row / self.period if stamped else 1.0)
+        youngest, oldest = any_phase(low, high, 0.0 if stamped else 1.0)  # the ages of stamps include the period
         if youngest == oldest:
             return str(oldest)
         law = uniform(youngest, oldest)
-        varies = high - low > TOLERANCE if stamped else len(self.counts) > 1
+        steady = min(self.row / self.period, 1.0)  # by how much ages differ at the phases of a sensor, but not in one
+        varies = high - low > steady + TOLERANCE if stamped else len(self.counts) > 1
         return str(law if varies else PerEpisode(law))
 
     @property
     def in_step(self) -> str:
         """The argument for a sensor in step with the control loop: the steps, or `uniform:LOW:HIGH` if they vary.
 
-        With stamps, LOW is the smallest delay and HIGH the 99th percentile. With windows, they are the 10th and 90th,
-        because a window is short and its estimate is rough.
+        With stamps, LOW is the smallest delay, and HIGH the 99th percentile of the ages before the next observation
+        arrives. With windows, they are the 10th and 90th, because a window is short and its estimate is rough.
         """
-        if len(self.steps) < (1 if self.method == "stamps" else 3):
-            return str(self.step)
-        bounds = (0.0, 0.99) if self.method == "stamps" else (0.1, 0.9)
-        low, high = (int(q) for q in np.quantile(self.steps, bounds, method="nearest"))
+        low, high = self.step_span
         return str(high) if low == high else f"uniform:{low}:{high}"
 
     @property
@@ -98,18 +98,21 @@ class Estimated:
         return dict(sorted(Counter(self.steps).items()))
 
     def save(self, path: str | Path) -> None:
-        """Write the steps, one a line, for `--delay recorded:FILE`."""
-        Path(path).write_text("".join(f"{step}\n" for step in self.steps or (self.step,)))
+        """Write a delay for each control step, one a line, for `--delay recorded:FILE`.
+
+        Raises:
+            DelayRLError: a delay by correlation, which is that of a part of the log and not of a step.
+        """
+        if not self.replay:
+            hint = f"train with --delay {self.train_with}"
+            raise DelayRLError(f"{self.path}: only stamps give a delay of each step to save, not a correlation; {hint}")
+        Path(path).write_text("".join(f"{step}\n" for step in ages.of_each_step(self.replay)))
 
     def json(self) -> dict[str, Any]:
         """Return a dict for `json.dumps`."""
         fields = {"kind": "log", **asdict(self), "train_with": self.train_with, "in_step": self.in_step}
+        del fields["replay"]
         return fields | {"steps": {str(step): count for step, count in self.counts.items()}}
-
-
-def rounded_up_steps(seconds: float, period: float) -> int:
-    """Return a delay in steps, rounded up: an action on its way must be in the history. See `TOLERANCE`."""
-    return max(0, int(np.ceil(seconds / period - TOLERANCE)))
 
 
 def from_log(
@@ -181,6 +184,10 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
     if used.sum() < 10:
         raise DelayRLError(f"{path}: {used.sum()} rows are left after a warm-up of {warm:g} s: too few")
     kept, period = delays[used], period or row_spacing
+    continuous = ages.without_pauses(made[used], row_spacing)
+    oldest = np.quantile(ages.at_the_next(continuous, kept), 0.99)
+    most = np.quantile(ages.steps_before_the_next(continuous, kept, period), 0.99, method="nearest")
+    steps = tuple(rounded_up_steps(d, period) for d in kept)
     parts = np.array_split(np.arange(len(kept)), min(10, len(kept) // 2))
     times, least = np.array([(made[used][part].mean(), kept[part].min()) for part in parts]).T
     return Estimated(
@@ -193,9 +200,11 @@ def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, 
         period=period,
         rows=len(kept),
         warm_up=warm,
-        steps=tuple(rounded_up_steps(d, period) for d in kept),
+        steps=steps,
         step=rounded_up_steps(float(np.median(kept)), period),
-        span=(float(kept.min()), float(np.quantile(kept, 0.99))),
+        span=(float(kept.min()), float(oldest)),
+        step_span=(min(steps), int(most)),
+        replay=ages.replay(continuous, kept, row_spacing, period),
         longest=float(kept.max()),
         slowest_warm_up=float(delays[~used].max()) if (~used).any() else None,
         drift=float(np.polyfit(times, least, 1)[0]) * 1e6,
@@ -242,8 +251,10 @@ def _correlated(
             windows.append((float(warm + part.mean() * size * row + size * row / 2), (lag - 1) * row))
     pairs, r = _pairs(log, commands, observations, episode, lags, row)
     strength = correlate.strength(correlation)[0]
-    delay = (first - 1) * row
-    shortest, most = np.quantile([d for _, d in windows], (0.1, 0.9)) if len(windows) > 2 else (delay, delay)
+    delay, steps = (first - 1) * row, tuple(rounded_up_steps(d, period) for _, d in windows)
+    step = rounded_up_steps(delay, period)
+    fewest, highest = np.quantile(steps, (0.1, 0.9), method="nearest") if len(windows) > 1 else (step, step)
+    shortest, most = np.quantile([d for _, d in windows], (0.1, 0.9)) if len(windows) > 1 else (delay, delay)
     return Estimated(
         method="correlation",
         path=str(path),
@@ -254,9 +265,10 @@ def _correlated(
         period=period,
         rows=rows,
         warm_up=warm,
-        steps=tuple(rounded_up_steps(d, period) for _, d in windows),
-        step=rounded_up_steps(delay, period),
+        steps=steps,
+        step=step,
         span=(float(shortest), float(most) + row),
+        step_span=(int(fewest), int(highest)),
         strength=float(strength.max()),
         peak=pairs[0],
         pairs=pairs[:10],

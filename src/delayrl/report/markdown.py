@@ -120,8 +120,9 @@ def _anchors(results: Iterable[Result]) -> str:
         anchors = (r.random_anchor, r.reference_anchor)
         values = [wording.anchor(a) or "none" for a in anchors]
         key = r.place.env, r.condition.steps
-        body[key] = (_escape(r.place.env), f"{r.condition.steps:,}", *values, _escape(r.reference_anchor.source))
-    return markdown_table(("Task", "Steps", "Random", "Ret_df", "Ret_df is the return of"), body.values())
+        names = (r.reference_anchor.source, wording.threshold(r) or "none")
+        body[key] = (_escape(r.place.env), f"{r.condition.steps:,}", *values, *map(_escape, names))
+    return markdown_table(("Task", "Steps", "Random", "Ret_df", "Ret_df is the return of", "Threshold"), body.values())
 
 
 def _results(summary: Summary, results: Iterable[Result]) -> str:

@@ -131,7 +131,7 @@ def _anchors(r: Result, names: Names) -> dict[str, Any]:
     values = {
         name: {"value": _rounded(a.value), "text": wording.anchor(a), "source": a.source} for name, a in anchors.items()
     }
-    return {"setting": setting, "task": task, "total": r.condition.steps, **values}
+    return {"setting": setting, "task": task, "total": r.condition.steps, "threshold": wording.threshold(r), **values}
 
 
 def _table(table: Table, names: Names) -> dict[str, Any]:

@@ -45,6 +45,7 @@ class Anchor(NamedTuple):
     returns: Floats  # of each of its runs, [seeds]
     smoothed: Floats  # the same, of the reference's smoothed curves: the threshold that learners are to reach
     source: str = ""  # its agent
+    steps: int = 0  # for which it has trained
 
     @property
     def value(self) -> float:
@@ -87,6 +88,7 @@ class Result:
     options_known: bool = True  # whether a grid or the configurations of all its runs say its options
     random_anchor: Anchor = NO_ANCHOR  # its returns are normalised by this
     reference_anchor: Anchor = NO_ANCHOR  # and by this
+    threshold_anchor: Anchor = NO_ANCHOR  # the same, or one that has trained for longer: what its curve is to reach
 
     @property
     def runs(self) -> int:
@@ -150,8 +152,8 @@ class Result:
     @property
     def threshold(self) -> float:
         """The reference's smoothed return after its last step; NaN without anchors, or if `random` is as good."""
-        better = self.reference_anchor.value > self.random_anchor.value
-        return statistics.mean_std(self.reference_anchor.smoothed)[0] if better else NAN
+        better = self.threshold_anchor.value > self.random_anchor.value
+        return statistics.mean_std(self.threshold_anchor.smoothed)[0] if better else NAN
 
     @property
     def missed(self) -> bool:
@@ -164,7 +166,8 @@ class Result:
         """95 % interval of it, infinite where the threshold is not reached; NaN where it is unknown."""
         if not self.runs or self.is_anchor or math.isnan(self.threshold):
             return NAN, NAN
-        return statistics.bootstrap_steps(self.curves.steps, self.smoothed, self.reference_anchor.smoothed)
+        low, high = statistics.bootstrap_steps(self.curves.steps, self.smoothed, self.threshold_anchor.smoothed)
+        return (NAN, NAN) if self.partial and math.isinf(high) else (low, high)  # it may yet get there
 
     @property
     def seeds_at_threshold(self) -> int:
@@ -255,22 +258,38 @@ def _state(states: set[CellState], has_rows: bool) -> CellState:
 
 
 def _anchored(result: Result, others: Sequence[Result]) -> Result:
-    """With the anchors of its task: same protocol and preset; delay-free SAC has trained for as many steps."""
+    """With the anchors of its task: same protocol and preset; delay-free SAC has trained for as many steps.
+
+    Where none has, the threshold alone is that of one that has trained for longer.
+    """
     setting, env = result.place.setting, result.place.env
     near = [o for o in others if o.place.setting.protocol == setting.protocol and o.place.env == env and o.runs]
     random = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
     ended = [o for o in near if o.place.setting == setting and not o.partial and FROM not in o.condition.overrides]
-    trained = [o for o in ended if o.condition.steps == result.condition.steps]
-    plain = [o for o in trained if o.condition.agent == "sac" and o.place.delay == 0]
-    random_anchor = reference_anchor = NO_ANCHOR
+    plain = [o for o in ended if o.condition.agent == "sac" and o.place.delay == 0]
+    same = [o for o in plain if o.condition.steps == result.condition.steps]
+    longer = [o for o in plain if o.condition.steps > result.condition.steps]
+    random_anchor = reference_anchor = threshold_anchor = NO_ANCHOR
     if random:  # it does not learn, so that all its evaluations are alike
         best = min(random, key=lambda o: (o.partial, -o.runs, o.place.setting != setting, _fewest_overrides(o)))
         random_anchor = Anchor(best.curves.returns.mean(1), best.smoothed[:, -1], "random")
-    if plain:
-        best = min(plain, key=_fewest_overrides)
-        reference_anchor = Anchor(best.curves.final, best.smoothed[:, -1], f"{best.place.label}, no delay")
-    return replace(result, random_anchor=random_anchor, reference_anchor=reference_anchor)
+    if same:
+        reference_anchor = threshold_anchor = _reference(min(same, key=_fewest_overrides))
+    elif longer:
+        threshold_anchor = _reference(min(longer, key=_longest))
+    result = replace(result, random_anchor=random_anchor, reference_anchor=reference_anchor)
+    return replace(result, threshold_anchor=threshold_anchor)
+
+
+def _reference(result: Result) -> Anchor:
+    source = f"{result.place.label}, no delay"
+    return Anchor(result.curves.final, result.smoothed[:, -1], source, result.condition.steps)
 
 
 def _fewest_overrides(result: Result) -> tuple[Any, ...]:
     return len(result.condition.overrides), -result.runs, _order(result)
+
+
+def _longest(result: Result) -> tuple[Any, ...]:
+    """Sort the plainest first, and of those the longest."""
+    return len(result.condition.overrides.keys() - {"steps"}), -result.condition.steps, _fewest_overrides(result)

@@ -1,6 +1,7 @@
 """Tables in the paper's layout: which rows and columns, and what stands in them."""
 
 import csv
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -133,6 +134,9 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None, 
         value, std, interval = result.steps_to_threshold, NAN, result.steps_interval
         if result.seeds_at_threshold:
             notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds")
+        longer = result.threshold_anchor.steps > result.condition.steps
+        if longer and result.runs and not math.isnan(result.threshold):
+            notes.append(f"reference of {result.threshold_anchor.steps:,} steps")
     else:
         value, std = statistics.mean_std(result.final)
         interval, (area, area_std) = result.final_interval, statistics.mean_std(result.area)

@@ -47,6 +47,14 @@ def anchor(anchor: Anchor) -> str:
     return f"{spread(*mean_std(anchor.returns))} ({seeds})" if anchor.returns.size else ""
 
 
+def threshold(result: Result) -> str:
+    """Write what the steps to Ret_df lead to: the smoothed return of which reference; empty if there is none."""
+    anchor = result.threshold_anchor
+    if not anchor.smoothed.size:
+        return ""
+    return f"{spread(*mean_std(anchor.smoothed))} ({anchor.source}, {anchor.steps:,} steps)"
+
+
 def reached(result: Result) -> str:
     """Write the steps to the threshold, × if it was missed."""
     return "×" if result.missed else steps(result.steps_to_threshold)
@@ -93,6 +101,7 @@ def caption(table: Table) -> str:
         return (
             "First evaluation at which the mean over seeds reaches that of delay-free SAC after training (×: none), "
             f"both averaged over the last {SMOOTHED} evaluations; its 95 % interval; how many seeds reach it. "
+            "Where no delay-free SAC has as many steps, the reference has more, and its steps are noted. "
             "Raw: return after the last step."
         )
     return (
@@ -104,7 +113,7 @@ def caption(table: Table) -> str:
 
 CELLS_CAPTION = (
     "Returns after the last step. Hours: of one worker, on a CPU one core, for all seeds together, at the speed since "
-    "its last start, beside whatever else the machine did."
+    "its last start, beside whatever else the machine did. Steps to Ret_df: to the threshold in the table of anchors."
 )
 AGGREGATE_CAPTION = (
     "Over all runs of all tasks; 95 % interval. Agents that lack a task on which another has ended at this delay are "

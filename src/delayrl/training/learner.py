@@ -1,6 +1,7 @@
 """Learner state and the jitted functions that update it, for all seeds at once."""
 
 import functools
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -130,19 +131,16 @@ class Program:
         agent, replay = learner
         phase = self.phases[index]
         reach = (phase.batch, self._spec.delay, self._agent.ahead(self._spec))
-        log_scale = self._spec.log_scale
 
         def update(agent: State, i: Int[Array, ""]) -> tuple[State, Metrics]:
             count = step // phase.every * phase.updates + i
 
-            def update_seed(
-                agent: State, replay: ring.Replay, key: Key, hidden: Int[Array, ""]
-            ) -> tuple[State, Metrics]:
+            def update_seed(agent: State, replay: ring.Replay, key: Key, hidden: Array) -> tuple[State, Metrics]:
                 for number in (step, index, i):
                     key = jax.random.fold_in(key, number)
                 sample_key, update_key = jax.random.split(key)
-                windows = ring.sample(replay, sample_key, *reach, hidden, log_scale, self.learnable)
-                return phase.update(agent, windows, update_key, count)
+                windows = ring.sample(replay, sample_key, *reach, hidden, self.learnable)
+                return phase.update(agent, replace(windows, log_scale=self._spec.log_scale), update_key, count)
 
             return jax.vmap(update_seed)(agent, replay, keys, jnp.asarray(hidden))
 

@@ -142,8 +142,8 @@ class Loop:
 
     def _can_learn(self) -> bool:
         """Whether every seed has steps to learn from, even while its newest are hidden."""
-        latest, learnable = self.group.setup.delay.latest, self.group.program.learnable
-        counts = jax.vmap(lambda replay: ring.drawable(replay, latest, learnable))(self.state.learner.replay)
+        hidden, learnable = self.group.setup.delay.latest, self.group.program.learnable
+        counts = jax.vmap(lambda replay: ring.drawable(replay, hidden, learnable))(self.state.learner.replay)
         return int(counts.min()) > 0
 
     def _random_actions(self) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorWrapper
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from delayrl.delays import Delay
@@ -57,7 +58,8 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
     """Show the augmented state of an environment wrapped by `Delayed` as one vector, [S + H·A + 1].
 
     Other wrappers may stand between the two (`NormalizeObservation`, `TimeLimit`). Their observations are shown; the
-    actions of the history are those that reached `Delayed`, in its units.
+    actions of the history are those that reached `Delayed`, in its units. If rewards are delayed, `TimeLimit` goes
+    inside `Delayed`.
 
     Attributes:
         augment: makes the vector of an observation of `Delayed` and its `info`.
@@ -67,7 +69,8 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
             `Delayed`.
 
     Raises:
-        DelayRLError: no `Delayed` in it, another `AugmentedObservation`, or observations that are not flat.
+        DelayRLError: no `Delayed` in it, another `AugmentedObservation`, observations that are not flat, or a
+            `TimeLimit` around delayed rewards, which it would lose.
     """
 
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]]) -> None:
@@ -77,6 +80,9 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
         while inner is not delayed:
             if isinstance(inner, AugmentedObservation):
                 raise DelayRLError("the observations are augmented already: use one AugmentedObservation")
+            if isinstance(inner, TimeLimit) and delayed.delay.reward.maximum:
+                line = "TimeLimit around Delayed loses the rewards and the termination on their way"
+                raise DelayRLError(f"{line}: put TimeLimit inside Delayed, Delayed(TimeLimit(task, 100), delay)")
             inner = inner.env  # type: ignore[attr-defined]
         check_spaces(name_of(env), env.observation_space, delayed.action_space)
         RecordConstructorArgs.__init__(self)

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import Autoreset, TimeLimit
 from numpy.typing import NDArray
 
 from delayrl.delays import Delay, DelayLike, as_delay
@@ -54,6 +54,15 @@ def find_delayed(env: Any) -> "Delayed | None":
             return env
         env = env.env
     return None
+
+
+def resets_itself(env: Any) -> bool:
+    """Return whether an environment is or wraps an `Autoreset`."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, Autoreset):
+            return True
+        env = env.env
+    return False
 
 
 def limit_of(env: Any) -> int | None:
@@ -126,6 +135,9 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
     arrives, the idle action acts. While a termination is on its way, the agent's actions have no effect. A time limit
     has no delay, and all that is on its way arrives with it.
 
+    Put `TimeLimit` inside: `Delayed(TimeLimit(task, 100), delay)`. This wrapper cannot see one around it, which loses
+    the rewards on their way and makes a truncation of a termination on its way. `Autoreset` goes around it.
+
     Args:
         env: any Gymnasium environment with flat Box observations and actions.
         delay: steps, a text ("uniform:1:5@fifo", "80ms+action=2"), a law, or a `Delay`: see `delayrl.delays`.
@@ -136,7 +148,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
             wrapper that repeats actions says it with a `dt` of its own.
 
     Raises:
-        DelayRLError: a bad delay, or an environment whose spaces are not flat boxes.
+        DelayRLError: a bad delay, an environment whose spaces are not flat boxes, or one that resets itself.
     """
 
     def __init__(
@@ -150,6 +162,9 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
     ) -> None:
         if find_delayed(env):
             raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
+        if resets_itself(env):
+            line = "Autoreset inside Delayed would carry what is on its way into the next episode"
+            raise DelayRLError(f"{line}: put it outside, Autoreset(Delayed(task, delay))")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
         self.step_seconds = seconds_of(env) if step_seconds is None else step_seconds

@@ -11,6 +11,9 @@ from delayrl.errors import DelayRLError
 from delayrl.wrappers.single import Info, check_spaces, find_delayed, history_rows, make_transit, name_of, seconds_of
 from delayrl.wrappers.transit import Fill, Transit
 
+OURS = ("age", "actions", "mask", "truth", "observation_age", "applied")  # what this wrapper adds to `info`
+INSIDE = "the whole delay inside, gymnasium.make_vec(..., wrappers=[lambda env: Delayed(env, '2+reward=3')])"
+
 
 class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     """Delay every environment of a vector, each with random numbers of its own.
@@ -22,7 +25,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     `info["final_obs"]` and `info["final_info"]` hold what the agent saw at the end of an episode.
 
     Args:
-        env: any Gymnasium vector environment with flat Box observations and actions.
+        env: any Gymnasium vector environment with flat Box observations and actions, none of them delayed already.
         delay: as `Delayed`.
         history: as `Delayed`.
         fill: as `Delayed`.
@@ -31,7 +34,8 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
 
     Raises:
         DelayRLError: as `Delayed`; for a delay of rewards, because a termination on its way would hold up the other
-            environments; and, at the first reset, for observations that are not NumPy's.
+            environments, and for environments with one inside, because both would draw the same random numbers; and,
+            at the first reset, for observations that are not NumPy's.
     """
 
     def __init__(
@@ -49,16 +53,14 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         actions: Any = env.single_action_space
         super().__init__(env)
         envs = getattr(env.unwrapped, "envs", ())
-        if any(inner.delay.maximum for inner in map(find_delayed, envs) if inner):
-            raise DelayRLError("the environments are delayed already: give one delay, e.g. '2+action=1'")
+        if any(max(inner.delay.maximum, inner.delay.reward.maximum) for inner in map(find_delayed, envs) if inner):
+            raise DelayRLError(f"the environments are delayed already: give one delay, here '2+action=1', or {INSIDE}")
         if step_seconds is None and envs:
             step_seconds = seconds_of(envs[0])
         self.delay = as_delay(delay, step_seconds)
         if self.delay.reward.maximum:
-            raise DelayRLError(
-                "a vector of environments cannot delay rewards, because all environments step together: "
-                "delay them inside, gymnasium.make_vec(..., wrappers=[lambda env: Delayed(env, ...)])"
-            )
+            line = "a vector of environments cannot delay rewards, because all environments step together"
+            raise DelayRLError(f"{line}: give {INSIDE}")
         self.history = history_rows(env, self.delay, history)
         self._transits = [make_transit(self.delay, self.history, fill, actions, idle) for _ in range(env.num_envs)]
         mode = env.metadata.get("autoreset_mode")
@@ -99,6 +101,9 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         truth, rewards, terminated, truncated, infos = self.env.step(actions)
         done = np.asarray(terminated) | np.asarray(truncated)
         ended_here = done if self._mode == "SameStep" else none
+        if ended_here.any():  # those of a Delayed without a delay inside have other shapes
+            last = infos.get("final_info", {})
+            infos["final_info"] = {name: last[name] for name in last if name.removeprefix("_") not in OURS}
         for i, transit in enumerate(self._transits):
             if reset_only[i]:
                 transit.reset(truth[i])
@@ -119,7 +124,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         obs, own = self._show([transit], truth[None])
         infos["final_obs"][i] = obs[0]
         last = {name: value[0] for name, value in own.items()}
-        infos["final_info"] = self._add_info(infos.get("final_info", {}), last, i)
+        infos["final_info"] = self._add_info(infos["final_info"], last, i)
 
     def _show(self, transits: list[Transit], truth: NDArray[Any]) -> tuple[NDArray[Any], Info]:
         """Return observations and our part of `info`, with a leading axis for the environments."""

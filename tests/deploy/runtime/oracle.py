@@ -150,7 +150,7 @@ class Oracle:
             raise ClockError
 
     def act(self, now: float) -> tuple[int, float, list[float], list[float]]:
-        """Age, content, the actions since, all of them; and all actions of the past."""
+        """Age, content, the actions since, all of them; and all actions up to now, those of missed steps included."""
         self.forward(now)
         if not self.observations():
             raise DelayRLError
@@ -158,6 +158,7 @@ class Oracle:
         if stamp - now > self.setting.period / 2:
             raise ClockError
         begins, actions, *_ = self.steps(now)
+        past = self.steps()[1]
         nearest = min(range(len(begins)), key=lambda j: (abs(begins[j] - stamp), -j))
         step = min(nearest, len(begins) - 1 - self.setting.action_delay)
         age = len(begins) - 1 - step
@@ -169,7 +170,7 @@ class Oracle:
             self.ages.append(age)
             self.delays.append(now - stamp)
             self.periods += [now - max(self.commands())]
-        return age, content, actions[step:], self.steps()[1]
+        return age, content, actions[step:], [*past, *actions[len(past) :]]
 
     def command(self, now: float, action: float) -> None:
         self.log.append(("command", now, action))

@@ -301,6 +301,34 @@ def test_overruns(on_overrun: str) -> None:
     assert controller.statistics.overruns == (1 if on_overrun == "raise" else 2)
 
 
+def test_hold_stays_in_the_policys_range() -> None:
+    """The history keeps what the plant did, which may lie beyond it."""
+    policy = counting(1)
+    policy.low, policy.high = np.float32([-3]), np.float32([3])
+    controller = Controller(policy, idle=[-9.0])
+    controller.observe([0.0], 0, now=2)
+    assert controller.act(2) == -3
+    controller.override([50.0])
+    assert controller.act() == 3
+    controller.applied([-50.0])
+    assert controller.act() == -3
+    controller.observe([1.0], 5)
+    controller.applied([7.0])
+    controller.observe([1.0], 5, now=6)
+    assert controller.act() == 2
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_after_missed_periods_hold_goes_on_as_the_plant(lag: int) -> None:
+    for idle, held in ((None, 2.0), ([0.0], 0.0)):
+        controller = Controller(counting(2), stamps="seconds", dt=0.25, idle=idle, action_delay=lag)
+        controller.observe([0.0], 0.0, 0.0)
+        assert controller.act(0.0) == 2
+        assert controller.act(2.0) == held  # the loop stalled; the plant has gone on by itself
+        controller.override([9.0], 2.25)
+        assert [controller.act(2.5), controller.act(2.5625), controller.act(3.0)] == [9, 9, 9 if idle is None else 0]
+
+
 def test_what_the_plant_really_did() -> None:
     policy = counting(4)
     controller = Controller(policy)
@@ -347,6 +375,10 @@ def test_episodes_do_not_mix() -> None:
     controller.observe([9.0], 0, episode=1)
     controller.act()
     assert policy.calls[-1] == (9.0, [0, 0, 0], 0)
+    assert not controller.applied([5.0], 0, episode=0)  # so was this report
+    assert controller.applied([6.0], 0, episode=1)
+    controller.act()
+    assert policy.calls[-1] == (9.0, [6, 0, 0], 1)
 
 
 @pytest.mark.parametrize(

@@ -135,6 +135,22 @@ def test_the_drive_is_idle_on_an_overrun(example: Any) -> None:
     assert (node.controller.statistics.overridden, node.controller.statistics.overruns) == (2, 2)
 
 
+def test_a_clock_that_steps_back_begins_an_episode(example: Any) -> None:
+    node = example.make_node(Counting(2, 1), dt=0.02)
+
+    def tick() -> int:
+        node.subscribed["joint_states"](joint_state([0.0], [0.0], Node.now))
+        node.timers[0][1]()
+        return len(node.published)
+
+    assert tick() == 1
+    Node.now -= 10**9
+    assert tick() == 1
+    assert "time went backwards" in node.log[-1]
+    Node.now += 20_000_000
+    assert (tick(), node.controller.episode) == (2, 1)
+
+
 def test_parameters_left_out_are_the_policys_own(example: Any) -> None:
     node = Node("parameters")
     node.declare_parameter = lambda name, default: SimpleNamespace(value=default)

@@ -34,7 +34,8 @@ def jax_policy(network: Network, arrays: Arrays) -> Act:
         return low + (jnp.tanh(raw) + 1) / 2 * (high - low)
 
     def on_host(obs: NDArray[np.float32], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
-        return np.asarray(act(params, obs, actions, np.int32(age)))
+        with jax.default_matmul_precision("float32"):  # a GPU rounds factors to fewer digits by default
+            return np.asarray(act(params, obs, actions, np.int32(age)))
 
     return on_host
 

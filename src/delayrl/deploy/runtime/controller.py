@@ -42,9 +42,9 @@ from delayrl.errors import DelayRLError
 OnOverrun = Literal["hold", "clip", "raise"]
 """What `act` does while the newest observation is older than the policy's longest age Δ.
 
-"hold" repeats the newest action of the history. "clip" shows the policy the observation at age Δ with the first Δ
-actions after it, an input that occurred in training; once these are forgotten, it holds. "raise" raises `OverrunError`
-and records nothing.
+"hold" goes on with what the plant does: the newest action of the history, or `idle` after missed periods, clipped to
+the policy's range. "clip" shows the policy the observation at age Δ with the first Δ actions after it, an input that
+occurred in training; once these are forgotten, it holds. "raise" raises `OverrunError` and records nothing.
 """
 
 EXTRA_STEPS = 64
@@ -84,8 +84,8 @@ class Controller:
         action_delay: steps from a command to its effect, κ, which is part of the age. None for the policy's own
             `action_delay`, or 0 if it has none.
         on_overrun: what `act` does while the newest observation is too old for the policy; see `OnOverrun`.
-        idle: what the plant does in a step without a command, [A]. None if it goes on with the action before, or with
-            zeros (clipped to the range) before the first.
+        idle: what the plant does in a step without a command, [A]. None if it goes on with the action before. Before
+            the first it then does the policy's own `idle`, or zeros if it has none, clipped to the range.
         clock: returns `now` where it is left out and stamps are in seconds.
 
     Raises:
@@ -111,7 +111,9 @@ class Controller:
         steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
-        first = _in_range(policy, np.zeros(policy.action_size, np.float32))
+        own = getattr(policy, "idle", None)
+        first = np.zeros(policy.action_size) if own is None else own
+        first = _in_range(policy, _action(policy, first, "the policy's idle"))
         capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
         self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
         self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
@@ -195,13 +197,15 @@ class Controller:
             with self._state_lock:
                 now = self._episode.command_time(now)
                 newest = self._episode.newest(now)
-                age, action = newest.age, self._episode.history.last.copy()
+                age = newest.age
                 if age > limit:
                     self._telemetry.counts["overruns"] += 1
                     if self.on_overrun == "raise":
                         raise OverrunError(f"the policy was trained for ages 0..{limit}; the newest is {age} steps old")
             if age <= limit or (self.on_overrun == "clip" and len(newest.actions) == age):
                 action = _decide(policy, newest.obs, newest.actions, min(age, limit))
+            else:
+                action = _in_range(policy, newest.held)
             with self._state_lock:
                 period = self._episode.record(action, now)
                 self._telemetry.counts["decisions"] += 1
@@ -220,16 +224,17 @@ class Controller:
             self._episode.record(values, self._episode.command_time(now))
             self._telemetry.counts["overridden"] += 1
 
-    def applied(self, action: ArrayLike, step: int | None = None) -> bool:
+    def applied(self, action: ArrayLike, step: int | None = None, *, episode: int | None = None) -> bool:
         """Correct the history where the plant did something else: an actuator saturated, a packet was lost.
 
         `action` is what the plant did, [A]; it may lie outside the policy's range. `step` is `controller.step` as it
-        was after `act`, None for the newest. Returns whether the step is still remembered. Raises DelayRLError for a
-        wrong size, numbers that are not finite, or a step that has no action.
+        was after `act`, None for the newest; `episode` is `controller.episode` of that time, None for the present one.
+        Returns whether the step is still remembered, which none of another episode is. Raises DelayRLError for a wrong
+        size, numbers that are not finite, or a step that has no action.
         """
         values = _action(self.policy, action, "the action")
         with self._state_lock:
-            return self._episode.history.correct(values, step)
+            return episode in (None, self.episode) and self._episode.history.correct(values, step)
 
 
 def _action_delay(policy: ControlPolicy, given: Any) -> int:

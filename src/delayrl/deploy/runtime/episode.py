@@ -73,7 +73,7 @@ class History:
         lead: steps from a command to its effect.
         capacity: how many steps are remembered.
         idle: the action of a step without a command, [A]; None to go on with the action before.
-        first: the action before any other, [A].
+        first: the action of a step before the first command, [A], where `idle` is None.
         counts: the counters `missed` and `replaced`, which `record` updates.
     """
 
@@ -86,10 +86,10 @@ class History:
         self._actions: deque[Action] = deque(maxlen=capacity)
         self.length = 0
 
-    @property
-    def last(self) -> Action:
-        """What the plant does if it gets no other command."""
-        return self._actions[-1] if self._actions else self._uncommanded()
+    def held(self, now: float, elapsed: int) -> Action:
+        """Return what the plant does at `now` if it gets no new command."""
+        missed = self._gap(now, elapsed) > 1
+        return self._actions[-1] if self._actions and not missed else self._uncommanded()
 
     def age(self, stamp: float, now: float, elapsed: int) -> tuple[int, int, list[Action]]:
         """Locate an observation that was made at `stamp`, for a command at `now`, `elapsed` steps after the start.
@@ -171,6 +171,7 @@ class Newest(NamedTuple):
     actions: list[Action]  # those since, oldest first; fewer than the age if the oldest are no longer remembered
     delay: float  # the time from the stamp to the command
     warm: bool  # whether the observation was made after the first command
+    held: Action  # what the plant does if it gets no new command
 
 
 class Episode:
@@ -207,9 +208,10 @@ class Episode:
             raise DelayRLError("no observation has arrived in this episode: wait until `controller.ready`")
         if self._stamp > now + self._clock.period / 2:
             raise ClockError(f"time went backwards: now is {now:g}, an observation of {self._stamp:g} is here")
-        step, age, actions = self.history.age(self._stamp, now, self._elapsed(now))
+        elapsed = self._elapsed(now)
+        step, age, actions = self.history.age(self._stamp, now, elapsed)
         warm = self._first_command is not None and step > self._first_command
-        return Newest(self.obs.copy(), age, actions, now - self._stamp, warm)
+        return Newest(self.obs.copy(), age, actions, now - self._stamp, warm, self.history.held(now, elapsed))
 
     def record(self, action: Action, now: float) -> float:
         """Add a command to the history. Returns the time since the last one, infinite for the first."""
