@@ -2,6 +2,7 @@
 
 import pytest
 
+from delayrl.agents.dcac import TEMPERATURE_RATE
 from delayrl.agents.registry import AGENTS
 from delayrl.run.condition import overrides_of, resolve
 from delayrl.run.configuration import values_of
@@ -94,7 +95,6 @@ PAPER = {
         "reward_scale": 5.0,
         "temperature": "fixed",
         "entropy_scale": 1.0,
-        "temperature_learning_rate": 1e-3,  # unused: the temperature is fixed
         "discount": 0.99,
         "target_rate": 5e-3,
         "log_std_range": [-20.0, 2.0],
@@ -147,6 +147,7 @@ def test_matched_dcac() -> None:
         name: x for name, x in MATCHED.items() if name in values
     }
     assert (values["learning_rate"], values["temperature"], values["reward_scale"]) == (3e-4, "learned", 1.0)
+    assert MATCHED["temperature_learning_rate"] == TEMPERATURE_RATE
 
 
 def test_matched_schedules() -> None:

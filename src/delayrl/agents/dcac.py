@@ -30,6 +30,9 @@ from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import input_size, network_input, view
 from delayrl.errors import DelayRLError
 
+TEMPERATURE_RATE = 1e-3
+"""Adam's step size for a learned temperature, that of the other agents in the preset `matched`."""
+
 
 class State(NamedTuple):
     """Actor, critics, target critics, the optimiser state that actor and critics share, a learned temperature's."""
@@ -63,7 +66,6 @@ class DCAC:
     reward_scale: Annotated[float, "factor on the rewards"] = 5.0
     temperature: Annotated[Literal["fixed", "learned"], "whether the entropy's weight is learned, as in SAC"] = "fixed"
     entropy_scale: Annotated[float, "weight of the entropy, the initial one if it is learned"] = 1.0
-    temperature_learning_rate: Annotated[float, "Adam's step size for a learned temperature", (0.0, 1.0)] = 1e-3
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
     target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
     log_std_range: Annotated[tuple[float, float], "bounds of the policy's log standard deviation"] = (-20.0, 2.0)
@@ -98,7 +100,7 @@ class DCAC:
         if self.entropy_scale <= 0:
             raise DelayRLError(f"a learned temperature starts above 0: entropy_scale must; got {self.entropy_scale}")
         log_temperature = jnp.log(jnp.asarray(self.entropy_scale, jnp.float32))
-        opt_state = optax.adam(self.temperature_learning_rate).init(log_temperature)
+        opt_state = optax.adam(TEMPERATURE_RATE).init(log_temperature)
         return state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
 
     def policy(self, actor: Params, x: Float[Array, "*batch input"]) -> Gaussian:
@@ -128,7 +130,7 @@ class DCAC:
         def loss(log_temperature: Array) -> tuple[Array, None]:
             return temperature_loss(log_temperature, -metrics["entropy"], -windows.action.shape[-1]), None
 
-        adam = optax.adam(self.temperature_learning_rate)
+        adam = optax.adam(TEMPERATURE_RATE)
         log_temperature, opt_state, _, _ = descend(adam, loss, state.log_temperature, state.temperature_opt_state)
         state = state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
         return state, metrics | {"temperature": temperature}

@@ -19,7 +19,6 @@ OLDER: Mapping[str, Any] = {
     "student_optimiser": "rmsprop",
     "temperature": "fixed",
     "temperature_every": 1,
-    "temperature_learning_rate": 1e-3,
     "update_after": 0,
     "tokens": 0,
     "observation_norm": "none",
