@@ -4,10 +4,12 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from delayrl.agents.base import Schedule
+from delayrl.core import replay as ring
 from delayrl.core.protocol import CORRECTED, Protocol
 from delayrl.core.types import Spec
 from delayrl.delays import as_delay
@@ -40,6 +42,8 @@ def trained(
             assert len(ended) == len(SEEDS)
 
     class Fake:
+        learnable = ring.ALL
+
         def act(self, agent: Any, seen: Any, keys: Any, step: int) -> Any:
             calls.append(("act", step))
             return np.full((len(SEEDS), 1), 0.5, np.float32)
@@ -68,7 +72,8 @@ def trained(
     group: Any = SimpleNamespace(
         setup=setup, seeds=SEEDS, keys=None, spec=Spec(2, 1, 2), program=Fake(), ways=Ways(), apply=map, folders=[]
     )
-    learner: Any = SimpleNamespace(agent=None, replay=SimpleNamespace(steps=np.array([99, 99])))
+    replay = jax.vmap(lambda steps: ring.init(Spec(2, 1, 2), 100)._replace(steps=steps))(np.array([99, 99]))
+    learner: Any = SimpleNamespace(agent=None, replay=replay)
     state = TrainState(0, learner, actors, [], None, [{}, {}], [(0, 0), (0, 0)])
     bar = SimpleNamespace(update=lambda count: None, set_postfix_str=lambda text: None)
     Loop(group, state, Recorder()).train(lambda: False, bar)  # type: ignore[arg-type]

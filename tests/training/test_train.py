@@ -180,7 +180,7 @@ def test_damaged_configuration(tmp_path: Path) -> None:
 
 
 def test_agents_check_the_schedule(tmp_path: Path) -> None:
-    with pytest.raises(delayrl.DelayRLError, match="must lie between random_steps and steps"):
+    with pytest.raises(delayrl.DelayRLError, match=r"must lie between random_steps \(or update_after\) and steps"):
         train("dida", tmp_path / "dida", expert_steps=400)
     with pytest.raises(delayrl.DelayRLError, match="lifting_end must be no later"):
         train("lifting", tmp_path / "lifting", lifting_end=400)
