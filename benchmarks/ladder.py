@@ -117,7 +117,7 @@ def compared_with(result: Result) -> str:
     """Return the arm of any-age that an arm of it is compared with: that with its batches, for that itself WHOLE."""
     if result.condition.agent not in ("any-age", "crossq:ANY_AGE") or name(result) == WHOLE:
         return ""
-    size = result.condition.overrides.get("batch_size")
+    size = result.condition.overrides.get("batch_size") or (128 if result.condition.preset == "small" else None)
     alike = f"{WHOLE}, `batch_size={size}`" if size else WHOLE
     return WHOLE if name(result) == alike else alike
 

@@ -4,7 +4,8 @@ python examples/ros2_node.py --ros-args -p policy:=BUNDLE -p on_overrun:=raise -
 
 Further parameters: `action_delay` and `dt`; a value below 0 (the default) stands for the policy's own. `idle` is what
 the drives do in a period without a command; by default they go on with the command before. While the newest observation
-is too old for the policy, no command is published (`on_overrun`: `raise`; or `hold`, `clip`).
+is too old for the policy, no command is published (`on_overrun`: `raise`; or `hold`, `clip`). If the clock steps back,
+a new episode begins, whose history assumes that the drives were idle: stop the robot before you set its clock.
 
 The observation is [position…, velocity…] of the JointState, in the order of the policy's task. Its age comes from
 `header.stamp`, which must be the time of the measurement on the clock of this node (`use_sim_time` works). rclpy comes
@@ -63,7 +64,7 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
                     self.controller.override(settings["idle"])
                 return
             except ClockError as error:  # the clock stepped back, or a simulation began again
-                self.get_logger().error(str(error))
+                self.get_logger().error(f"{error}; a new episode begins, as if the drives had been idle")
                 self.controller.reset()
                 return
             except DelayRLError as error:

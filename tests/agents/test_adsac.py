@@ -198,6 +198,8 @@ def test_temperatures_are_updated_as_often_as_asked() -> None:
         )
         counts = new.temperature_opt_state[0].count, new.auxiliary.temperature_opt_state[0].count
         assert [int(count) for count in counts] == [2 // every, 2 // every]
+    with pytest.raises(DelayRLError, match="at most actor_updates, 2, or no temperature is ever updated; got 3"):
+        dataclasses.replace(agent, temperature_every=3).init(Spec(10, 2, 3), jax.random.key(0))
 
 
 def test_augmented_actor_follows_both_critics() -> None:

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import (
+    Autoreset,
     ClipReward,
     FrameStackObservation,
     NormalizeObservation,
@@ -218,7 +219,8 @@ def test_wrappers_outside_delayed() -> None:
     with pytest.raises(DelayRLError, match="Monitor stands outside"):
         adapt(np.sin, monitor(delayed))
     monitor.__module__ = "stable_baselines3.common.monitor"
-    for kind in (monitor, RecordEpisodeStatistics, NormalizeReward, lambda env: TimeLimit(ClipReward(env, -1), 10)):
+    limited = lambda env: TimeLimit(ClipReward(env, -1), 10)  # noqa: E731
+    for kind in (monitor, Autoreset, RecordEpisodeStatistics, NormalizeReward, limited):
         assert adapt(np.sin, kind(AugmentedObservation(kind(delayed)))).max_age == 2
 
 

@@ -57,7 +57,7 @@ class ADSAC:
         Behaviour,
         "who acts in training: augmented, or lower-q (for τ = 0, the actor with the lower Q; else augmented)",
     ] = "lower-q"
-    temperature_every: Annotated[int, "coins from one update of both temperatures to the next"] = 1
+    temperature_every: Annotated[int, "coins of a round from one update of both temperatures to the next"] = 1
     evaluation: Annotated[Literal["mode", "sample"], "action in evaluation; the released code samples"] = "mode"
 
     @property
@@ -82,6 +82,11 @@ class ADSAC:
         if self.auxiliary_delay > spec.delay:
             raise DelayRLError(
                 f"ad-sac's auxiliary_delay must be no longer than the delay {spec.delay}; got {self.auxiliary_delay}"
+            )
+        if self.temperature_every > self.learner.actor_updates:
+            raise DelayRLError(
+                f"temperature_every must be at most actor_updates, {self.learner.actor_updates}, or no temperature is "
+                f"ever updated; got {self.temperature_every}"
             )
         auxiliary_key, augmented_key = jax.random.split(key)
         auxiliary = self.learner.init(replace(spec, delay=self.auxiliary_delay), auxiliary_key)

@@ -13,12 +13,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import (
+    Autoreset,
     HumanRendering,
     NormalizeReward,
     OrderEnforcing,
     PassiveEnvChecker,
     RecordEpisodeStatistics,
     RecordVideo,
+    RenderCollection,
     TimeLimit,
 )
 from numpy.typing import ArrayLike, NDArray
@@ -33,8 +35,15 @@ from delayrl.wrappers.single import find_delayed, name_of
 
 SAMPLES, TOLERANCE = 200, 1e-4
 """Inputs on which layers are compared with the policy that they are of, and their largest error, of the range."""
-HARMLESS: tuple[Any, ...] = (gym.Wrapper, AugmentedObservation, NormalizeReward, TimeLimit, OrderEnforcing)
-HARMLESS += (PassiveEnvChecker, RecordEpisodeStatistics, RecordVideo, HumanRendering)
+HARMLESS: tuple[Any, ...] = (
+    gym.Wrapper,
+    gym.RewardWrapper,
+    AugmentedObservation,
+    Autoreset,
+    NormalizeReward,
+    TimeLimit,
+)
+HARMLESS += (OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, RecordVideo, RenderCollection, HumanRendering)
 MONITOR = "stable_baselines3.common.monitor.Monitor"
 """Classes whose `step` and `reset` pass observations and actions on as they are, and one more by its name."""
 
@@ -112,7 +121,7 @@ def _keeps_all(layer: Any) -> bool:
     """Whether a wrapper is known to pass observations and actions on as they are."""
     owners = [next(kind for kind in type(layer).__mro__ if name in vars(kind)) for name in ("step", "reset")]
     known = (kind in HARMLESS or f"{kind.__module__}.{kind.__qualname__}" == MONITOR for kind in owners)
-    return isinstance(layer, gym.RewardWrapper) or all(known)
+    return all(known)
 
 
 def export_layers(

@@ -1,4 +1,4 @@
-"""The files of a policy bundle: the weights, and how to use them. They are data; none is code.
+"""The files of a policy bundle: the weights, and how to use them. They are read as data; none is run.
 
 ```
 bundle.json          network, task, delay, evaluation; sizes and SHA-256 of the files below; its own checksum

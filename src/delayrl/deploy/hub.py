@@ -90,7 +90,7 @@ def card(metadata: Mapping[str, Any], repo: str) -> str:
     lines += ["The return is raw, of the last evaluation of one training run under its protocol.", ""]
     lines += ["```", "pip install 'delayrl[hub]'", f"delayrl pull {repo} --out bundle", "```", ""]
     lines += ["```python", "from delayrl.deploy import load_bundle", ""]
-    lines += ['policy = load_bundle("bundle")  # weights and JSON; nothing in it is code']
+    lines += ['policy = load_bundle("bundle")  # reads weights and JSON, and runs no code of the bundle']
     lines += ["action = policy(obs, actions, age)", "```", ""]
     yaml = [f"{name}: {json.dumps(value)}" for name, value in head.items()]  # JSON is YAML
     return "\n".join(["---", *yaml, "---", "", *lines])
