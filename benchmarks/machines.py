@@ -122,8 +122,8 @@ def table() -> str:
     words = (
         "Seed-steps a second, processes × seeds of each; medians of rounds of learning, HalfCheetah-v5, preset `small`."
     )
-    rows = "Rows: `benchmarks/results/machines.jsonl`."
-    return f"{markdown_table(['agent', 'Δ', *heads], lines)}\n\n{words} {' '.join(notes)} {rows}"
+    words += f" {' '.join(notes)} Rows: `benchmarks/results/machines.jsonl`."
+    return f"{markdown_table(['agent', 'Δ', *heads], lines)}\n\n{words}"
 
 
 if __name__ == "__main__":

@@ -96,6 +96,7 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
     import jax
 
     import delayrl
+    from delayrl.cli.console import pair
     from delayrl.training.recorder import Recorder
 
     evaluate = Recorder.evaluate
@@ -124,15 +125,6 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
             callback=after,
             **{"steps": given.steps, "evaluate_every": given.evaluate_every, "evaluation_episodes": EPISODES} | options,
         )
-
-
-def pair(text: str) -> tuple[str, Any]:
-    """Split NAME=VALUE; the value is JSON if it parses as JSON, otherwise text."""
-    name, _, value = text.partition("=")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
 
 
 def library(given: argparse.Namespace, clock: Clock, record: Record) -> None:

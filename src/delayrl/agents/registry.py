@@ -70,6 +70,7 @@ def _soft(summary: str, paper: str, **sees: str) -> Registration:
 _MATCHED_SAC = SAC(entropy_unit="scaled")
 """VDPO's SAC, with entropies over [-1, 1]: the preset `matched` builds every agent on it (docs/decisions.md)."""
 _MATCHED_BPQL = replace(_MATCHED_SAC, actor_sees="augmented")
+# a coin picks one of its two actors, hence four
 _MATCHED_ADSAC = ADSAC(replace(_MATCHED_BPQL, critic_sees="augmented", actor_updates=4), temperature_every=2)
 _MATCHED_VDPO = VDPO(_MATCHED_SAC, width=64, layers=2, dropout=0.0, clone_every=1, clone_updates=1)
 _MATCHED_DIDA = DIDA(

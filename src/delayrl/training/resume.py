@@ -100,10 +100,12 @@ def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -
     """Return a fresh agent with the networks of another run that fit. Raises DelayRLError if none does."""
     arrays = source.arrays("agent")
     fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
-    for name, array in dict(arrays).items():  # a reference is an agent itself; normalisation keeps the agent in `agent`
+    renamed: Arrays = {}
+    for name, array in arrays.items():  # a reference is an agent itself; normalisation keeps the agent in `agent`
         outer = "agent." * name.startswith("agent.")
         inner = name.removeprefix(outer).removeprefix("reference.")
-        arrays = {f"{outer}reference.{inner}": array, f"{outer}{inner}": array} | arrays
+        renamed |= {f"{outer}reference.{inner}": array, f"{outer}{inner}": array}
+    arrays = renamed | arrays
     taken, left = fitting(fresh, arrays)
     if not set(taken) - {"moments"}:
         where = source.path.parents[1]
