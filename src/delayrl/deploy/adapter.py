@@ -97,7 +97,7 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         history,
         delayed.step_seconds,
         delay.action.maximum,
-        delayed._transit._idle,
+        delayed.idle,
     )
 
 

@@ -175,6 +175,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         gym.Wrapper.__init__(self, env)
         self.history = history_rows(env, self.delay, history)
         self._transit = make_transit(self.delay, self.history, fill, env.action_space, idle)
+        self.idle = self._transit.idle  # as it acts: within the bounds
         self._limit = limit_of(env)
         self._masks = np.tri(self.history + 1, self.history, -1, bool)  # by age: true in the first `age` slots
         self._dtype = env.action_space.dtype

@@ -107,7 +107,7 @@ class Transit:
     """
 
     def __init__(self, delay: Delay, history: int, fill: Fill, idle: NDArray[Any]):
-        self._fill, self._idle = fill, idle
+        self._fill, self.idle = fill, idle
         self._observations, self._rewards = MessageQueue(delay.observation), RewardQueue(delay.reward)
         self._actions = MessageQueue(delay.action)
         self._max_action_delay, self._max_reward_delay = delay.action.maximum, delay.reward.maximum
@@ -127,7 +127,7 @@ class Transit:
     def reset(self, truth: NDArray[Any], seed: int | None = None) -> None:
         """Start an episode with the true s_0, [S]. A seed fixes the delays apart from the environment's randomness."""
         self.time, self._end, self.over = 0, None, False
-        self._ring[:] = self._idle
+        self._ring[:] = self.idle
         self._rewards.start()
         self._actions.start()
         self._truths[0], self._applied[0] = np.array(truth), 0
