@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import forecast
+import front
 import ladder
 import matplotlib
 import numpy as np
@@ -328,7 +329,7 @@ def main() -> None:
         title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
         draw_against_delay("pusher-random", title, images / "pusher-delays.png", labels)
     for name, pages in {
-        "pendulum": ["README.md", "docs/index.md", "docs/algorithms/vdpo.md", "docs/benchmarks.md"],
+        "pendulum": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "walk": ["docs/benchmarks.md"],
         "walk-random": ["docs/benchmarks.md"],
@@ -356,11 +357,12 @@ def main() -> None:
         insert(root / "docs" / "benchmarks.md", "learning", text)
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("any-age-ladder", "any-age-crossq")]
     if rows := [file for file in rows if file.exists()]:
-        arms, goals, front = ladder.sections(rows, images)
+        arms, goals = ladder.sections(rows, images / "ladder.png")
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
         insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
-        for page in ("README.md", "docs/index.md"):
-            insert(root / page, "halfcheetah", front)
+    result = front.section([HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "any-age-ladder")], images)
+    for page in ("README.md", "docs/index.md"):
+        insert(root / page, "result", result)
     if forecast.OUT.exists():
         insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())
     if list((HERE / "results" / "times").glob("*.jsonl")):

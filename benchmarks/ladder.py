@@ -21,7 +21,6 @@ from delayrl.report import statistics
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
-from delayrl.report.wording import interval, normalised
 from delayrl.run.condition import Condition
 
 AWAY = 1_500
@@ -41,25 +40,14 @@ GOALS = [
 """Two arms, and the ratio of their returns that is aimed at."""
 
 
-FRONT = {
-    "`sac`, no delay": "#8c8c8c",
-    "`any-age`": "#1f6feb",
-    "`bpql`, `critic_norm=layer`": "#9a6700",
-    "`bpql`": "#1a7f37",
-}
-"""The arms on the first page, and their colours."""
-
-
-def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
-    """Draw the curves; return the tables of all arms, of the goals, and of the first page, with what made them."""
+def sections(files: list[Path], picture: Path) -> tuple[str, str]:
+    """Draw the curves; return the tables of all arms, with what made them, and of the goals."""
     results: list[Result] = []
     for collected in map(read_table, files):
         cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
-    draw([(f"C{number % 10}", r) for number, r in enumerate(learners)], pictures / "ladder.png")
-    shown = [r for r in learners if name(r) in FRONT]
-    draw([(FRONT[name(r)], r) for r in shown], pictures / "halfcheetah.png")
+    draw(learners, picture)
     every = [used for file in files for used in trained_with(file)]
     words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
     rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
@@ -67,7 +55,7 @@ def sections(files: list[Path], pictures: Path) -> tuple[str, str, str]:
     made += f"seeds, each of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
     slower = update_times(files[0].parent / "arms.jsonl")
-    return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners), f"{front(shown)}\n\n{made}"
+    return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
 
 
 def trained_with(file: Path) -> list[dict[str, Any]]:
@@ -75,19 +63,6 @@ def trained_with(file: Path) -> list[dict[str, Any]]:
     query = "SELECT versions FROM runs JOIN cells ON cells.id = runs.cell WHERE state = 'done' ORDER BY cells.number"
     with contextlib.closing(sqlite3.connect(file)) as table:
         return [used for (text,) in table.execute(query) for used in json.loads(text)]
-
-
-def front(results: list[Result]) -> str:
-    """Return the table of the first page."""
-    head = ["agent", "delay", "normalised, 95 % interval", "return at the end", "each seed", "steps", "GFLOP a step"]
-    body = []
-    for result in results:
-        seeds = " · ".join(f"{value:,.0f}" for value in result.curves.final)
-        mean, within = result.final.mean(), interval(result.final_interval, normalised)
-        score = "" if np.isnan(mean) else normalised(mean) + (f" ({within})" if within else "")
-        cells = [name(result), str(result.place.delay), score, spread(result.curves.final), seeds]
-        body.append([*cells, f"{result.condition.steps:,}", gflop(result)])
-    return markdown_table(head, body)
 
 
 def gflop(result: Result) -> str:
@@ -178,13 +153,13 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
     return f"{gaps.mean():+,.0f} ({gaps.mean() - half:+,.0f} to {gaps.mean() + half:+,.0f})"
 
 
-def draw(arms: list[tuple[str, Result]], out: Path) -> None:
-    """Draw the curves of the arms, each in its colour, in one picture."""
+def draw(arms: list[Result], out: Path) -> None:
+    """Draw the curves of the arms in one picture."""
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
-    for colour, result in arms:
-        curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
+    for number, result in enumerate(arms):
+        curve(axes, *result.curves, f"C{number % 10}").set_label(name(result).replace("`", ""))
     axes.set_title("HalfCheetah-v5, 25 steps late unless said")
-    axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for _, r in arms]))))
+    axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)

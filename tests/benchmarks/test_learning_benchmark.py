@@ -12,6 +12,7 @@ from scipy import stats
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "learning")]
 
+import front  # noqa: E402
 import ladder  # noqa: E402
 import timed  # noqa: E402
 from learning import times  # noqa: E402
@@ -113,10 +114,30 @@ def test_the_ladder_compares_with_bpql() -> None:
     changed = result("any-age", 25, [[1000.0, 1000.0], [1000.0, 1000.0]], batch_size=128, n_steps=5)
     lines = [line.strip("| ").split(" | ") for line in ladder.table([whole, smaller, changed]).splitlines()[2:]]
     assert [line[5].split(" ")[0] for line in lines] == ["", "+500", "+750"]  # each with any-age that has its batches
-    front = ladder.front([base]).splitlines()[2].split(" | ")
-    assert front[1:3] + front[4:6] == ["25", "0.30 (0.28 to 0.33)", "1,000 · 1,200", "0"]
-    bare = replace(base, random_anchor=NO_ANCHOR)
-    assert ladder.front([bare]).splitlines()[2] == "| `bpql` | 25 |  | 1,100 ± 141 | 1,000 · 1,200 | 0 | 1.23 |"
+
+
+def test_the_result_of_the_first_page(tmp_path: Path) -> None:
+    """Each arm where it has ended, with most seeds, at the budget of its task; nothing for what has not run."""
+
+    def of(agent: str, case: front.Case, returns: list[float], steps: int = 0, **overrides: float) -> Result:
+        plain = result(agent, case[1], [[0.0, end] for end in returns], **overrides)
+        condition = replace(plain.condition, env=case[0], steps=steps or front.STEPS[case[0]])
+        return replace(plain, place=plain.place._replace(env=case[0]), condition=condition)
+
+    late, later = front.CASES[1:3]
+    few = of("vdpo", late, [1000.0, 1200.0], tokens=1280)
+    unfinished = replace(of("bpql", late, [3900.0] * 9), seeds=10)
+    longer = of("bpql", late, [3900.0] * 9, steps=10**7)
+    many = of("any-age", later, [10.0, 20.0, 30.0, 40.0, 50.0])
+    sac = of("sac", (late[0], 0), [3900.0] * 5)
+    chosen = front.choose([few, many, of("any-age", later, [0.0]), sac, unfinished, longer, of("dida", late, [1.0])])
+    lines = [line.split(" | ") for line in front.table(chosen).splitlines()[2:]]
+    assert [line[0] for line in lines] == ["| `sac`, no delay", "| `vdpo`", "| `any-age`"]
+    assert lines[0][1:] == ["**1.00**<br>3,900 ± 0"] * 2 + ["", " |"]
+    assert lines[1][2] == "**0.30** (0.28 to 0.33; 2 seeds)<br>1,100 ± 141"
+    assert lines[2][3] == "**0.03** (0.03 to 0.04)<br>30.0 ± 15.8"
+    front.draw(chosen, tmp_path / "result.png")
+    assert (tmp_path / "result.png").stat().st_size > 5_000
 
 
 def test_update_times_are_paired_by_round(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from delayrl.core import networks
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import k_step_return, soft_target, temperature_loss
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.core.views import input_size, network_input, view
+from delayrl.core.views import input_size, look, network_input
 from delayrl.errors import DelayRLError
 
 TEMPERATURE_RATE = 1e-3
@@ -145,7 +145,7 @@ class DCAC:
     ) -> tuple[Array, Metrics]:
         """Return the weighted sum of the critics' squared error and the actor's negative soft value, and metrics."""
         actor, critic = params
-        rolls = jax.vmap(self.roll, (None, 0, 0))(actor, windows, jax.random.split(key, windows.lead.shape[0]))
+        rolls = self.roll(actor, windows, key)
         y = self.soft_return(rolls, self.reward_scale, temperature, values(target, rolls.x_last))
         value = values(critic, jax.lax.stop_gradient(rolls.x))
         critic_loss = ((value - jax.lax.stop_gradient(y)) ** 2).mean(-1).sum()
@@ -171,40 +171,47 @@ class DCAC:
             k_step_return(reward, self.discount, rolls.steps), self.discount**rolls.steps, rolls.ended, value.min(0)
         )
 
-    def roll(self, actor: Params, window: Window, key: Key) -> Roll:
-        """Re-sample the actions of one window from the current policy (the paper's partial trajectory re-sampling).
+    def roll(self, actor: Params, windows: Window, key: Key) -> Roll:
+        """Re-sample the actions of each window from the current policy (the paper's partial trajectory re-sampling).
 
-        It starts at t. If the window terminates at T, half of the time it starts there, to learn the value at t + Δ:
+        It starts at t. If a window terminates at T, half of the time it starts there, to learn the value at t + Δ:
         the terminal state arrives only at T + Δ, and re-sampled stretches lead to the x before it, which need values.
         """
-        delay, slots = window.delay, jnp.arange(window.delay)
+        delay = windows.delay
         coin_key, policy_key = jax.random.split(key)
-        over = window.terminated.any()
-        from_end = over & jax.random.bernoulli(coin_key)
-        window = shift(window, jnp.where(from_end, window.lead, 0))
+        over = windows.terminated.any(-1)
+        from_end = over & jax.random.bernoulli(coin_key, shape=over.shape)
+        windows = jax.vmap(shift)(windows, jnp.where(from_end, windows.lead, 0))
 
         def step(actions: Array, now: tuple[Array, Key]) -> tuple[Array, Array]:
             i, key = now
-            x = network_input(view(replace(window, action=actions), i), "augmented")
+            x = jax.vmap(lambda window: look(window, "augmented", i))(replace(windows, action=actions))
             action, log_prob = networks.sample(self.policy(actor, x), key)
-            return actions.at[delay + i].set(action), log_prob
+            return actions.at[:, delay + i].set(action), log_prob
 
-        actions, log_prob = jax.lax.scan(step, window.action, (slots, jax.random.split(policy_key, delay)))
-        # ages are known up to the window's last row, and after a termination, when nothing more arrives
-        true_still = (window.age[delay + 1 :] > slots) & ((slots < window.lead) | over)
-        steps = jnp.cumprod(true_still.astype(jnp.int32)).sum()
-        newest = delay + jnp.arange(delay + 1) - window.age[delay:]
-        received = jnp.concatenate([jnp.zeros(1), jnp.cumsum(window.reward)])  # [c]: sum of the rewards before r_c
-        first = jnp.where(from_end, delay - window.lead, 0)
-        x, x_last = (network_input(view(replace(window, action=actions), i), "augmented") for i in (first, steps))
-        return Roll(
-            x,
-            x_last,
-            jnp.roll(jnp.diff(received[newest]), -first),
-            jnp.roll(log_prob, -first),
-            steps - first,
-            from_end,
-        )
+        actions, log_prob = jax.lax.scan(step, windows.action, (jnp.arange(delay), jax.random.split(policy_key, delay)))
+        windows = replace(windows, action=actions)
+        return jax.vmap(stretch)(windows, log_prob.T, from_end)
+
+
+def stretch(window: Window, log_prob: Float[Array, " delay"], from_end: Bool[Array, ""]) -> Roll:
+    """Return the stretch of a window whose actions have been re-sampled, from their log-densities."""
+    delay, slots, over = window.delay, jnp.arange(window.delay), window.terminated.any()
+    # ages are known up to the window's last row, and after a termination, when nothing more arrives
+    true_still = (window.age[delay + 1 :] > slots) & ((slots < window.lead) | over)
+    steps = jnp.cumprod(true_still.astype(jnp.int32)).sum()
+    newest = delay + jnp.arange(delay + 1) - window.age[delay:]
+    received = jnp.concatenate([jnp.zeros(1), jnp.cumsum(window.reward)])  # [c]: sum of the rewards before r_c
+    first = jnp.where(from_end, delay - window.lead, 0)
+    x, x_last = (look(window, "augmented", i) for i in (first, steps))
+    return Roll(
+        x,
+        x_last,
+        jnp.roll(jnp.diff(received[newest]), -first),
+        jnp.roll(log_prob, -first),
+        steps - first,
+        from_end,
+    )
 
 
 def shift(window: Window, by: Int[Array, ""]) -> Window:

@@ -1,0 +1,114 @@
+"""The result on the first page: what each method is worth, from the cells of `evidence-1` that have ended."""
+
+from pathlib import Path
+
+import numpy as np
+from ladder import arm, spread, trained_with
+from learning.curves import curve
+from matplotlib import pyplot
+from which import BUDGET, ended
+
+from delayrl.bench.results import read_table
+from delayrl.report.markdown import markdown_table
+from delayrl.report.results import Result
+from delayrl.report.summary import summarise
+from delayrl.report.wording import interval, normalised
+
+Case = tuple[str, int]
+Chosen = dict[tuple[str, Case], Result]
+"""Results by arm and case."""
+CASES: tuple[Case, ...] = (
+    ("HalfCheetah-v5", 5),
+    ("HalfCheetah-v5", 25),
+    ("delayrl/Pusher-v4", 25),
+    ("delayrl/Pusher-v4", 50),
+)
+"""Task and delay of each column, and of each panel of the picture; the second decides the order of the rows."""
+STEPS = {"HalfCheetah-v5": 100_000, "delayrl/Pusher-v4": 40_000}
+SEEDS = 5
+COLOURS = {
+    "`sac`, no delay": "#8c8c8c",
+    "`any-age`": "#8250df",
+    "`vdpo`": "#1f6feb",
+    "`lifting`": "#bc4c00",
+    "`bpql`": "#1a7f37",
+    "`bpql`, `critic_norm=layer`": "#6fdd8b",
+    "`a-sac`": "#d4a72c",
+    "`dcac`": "#0a7ea4",
+    "`sac-memoryless`": "#d1242f",
+}
+
+
+def section(files: list[Path], pictures: Path) -> str:
+    """Draw the curves as `result.png`; return the table, with what made its rows."""
+    results: list[Result] = []
+    for file in files:
+        collected = read_table(file)
+        results += summarise(collected.rows, collected.standing, collected.configs).results.values()
+    chosen = choose(results)
+    draw(chosen, pictures / "result.png")
+    used = [versions for file in files for versions in trained_with(file)]
+    words = dict.fromkeys(f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in used)
+    rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
+    steps = " and ".join(f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
+    made = f"Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other number is given. In "
+    made += "brackets the 95 % interval of the mean; below it the return at the end, ± the standard deviation over "
+    made += f"seeds, each of ten episodes. {'; '.join(words)}. Rows: {rows}."
+    return f"{table(chosen)}\n\n{made}"
+
+
+def choose(results: list[Result]) -> Chosen:
+    """Return what has ended for each arm and case, that with most seeds; delay-free SAC in each case of its task."""
+    chosen: Chosen = {}
+    for result in sorted((r for r in results if ended(r) and name(r) in COLOURS), key=lambda r: r.runs):
+        task, own, condition = result.place.env, result.place.delay, result.condition
+        if condition.preset == "matched" and condition.steps == STEPS.get(task):
+            chosen |= {
+                (name(result), (env, delay)): result for env, delay in CASES if env == task and own in (0, delay)
+            }
+    return chosen
+
+
+def short(env: str) -> str:
+    """Return the task without who registers it."""
+    return env.removeprefix("delayrl/")
+
+
+def name(result: Result) -> str:
+    """Return the arm in words, without the options of its budget."""
+    return ", ".join(word for word in arm(result.condition).split(", ") if word.strip("`").split("=")[0] not in BUDGET)
+
+
+def table(chosen: Chosen) -> str:
+    """Return a Markdown table: a row for each arm."""
+
+    def rank(label: str) -> float:
+        return -chosen[label, CASES[1]].curves.final.mean() if (label, CASES[1]) in chosen else np.inf
+
+    head = ["", *(f"{short(env)}, Δ = {delay}" for env, delay in CASES)]
+    labels = sorted(dict.fromkeys(label for label, _ in chosen), key=rank)
+    return markdown_table(head, [[label, *(cell(chosen.get((label, case))) for case in CASES)] for label in labels])
+
+
+def cell(result: Result | None) -> str:
+    """Write a normalised return with its interval, and the raw one below; nothing for what has not run."""
+    if result is None:
+        return ""
+    final, within = result.curves.final, interval(result.final_interval, normalised)
+    seeds = f"; {result.runs} seeds" if result.runs != SEEDS else ""
+    raw = spread(final) if abs(final.mean()) > 999 else f"{final.mean():.1f} ± {final.std(ddof=1):.1f}"
+    return f"**{normalised(result.final.mean())}**" + (f" ({within}{seeds})" if within else "") + f"<br>{raw}"
+
+
+def draw(chosen: Chosen, out: Path) -> None:
+    """Draw a panel of curves for each case."""
+    figure, panels = pyplot.subplots(2, 2, figsize=(10, 7), layout="constrained")
+    lines = {}
+    for axes, case in zip(panels.flat, CASES, strict=True):
+        for label, colour in COLOURS.items():
+            if (label, case) in chosen:
+                lines[label.replace("`", "")] = curve(axes, *chosen[label, case].curves, colour)
+        axes.set_title(f"{short(case[0])}, {case[1]} steps late")
+    figure.legend(lines.values(), lines, loc="outside lower center", ncols=5, frameon=False)
+    figure.savefig(out, dpi=110)
+    pyplot.close(figure)
