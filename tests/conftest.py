@@ -14,6 +14,7 @@ from pathlib import Path
 
 CACHE = Path(__file__).parents[1] / ".cache" / "jax"
 CACHE_BYTES = 2**30
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's threads wait for one another on cores that others use
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
