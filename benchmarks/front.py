@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from ladder import arm, spread, trained_with
+from ladder import arm, of, spread, trained_with
 from learning.curves import curve
 from matplotlib import pyplot
 from which import BUDGET, ended
@@ -41,19 +41,15 @@ COLOURS = {
 
 def section(files: list[Path], pictures: Path) -> str:
     """Draw the curves as `result.png`; return the table, with what made its rows."""
-    results: list[Result] = []
-    for file in files:
-        collected = read_table(file)
-        results += summarise(collected.rows, collected.standing, collected.configs).results.values()
-    chosen = choose(results)
+    tables = [read_table(file) for file in files]
+    chosen = choose([r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()])
     draw(chosen, pictures / "result.png")
     used = [versions for file in files for versions in trained_with(file)]
     words = dict.fromkeys(f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in used)
-    rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
     steps = " and ".join(f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
     made = f"Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other number is given. In "
     made += "brackets the 95 % interval of the mean; below it the return at the end, ± the standard deviation over "
-    made += f"seeds, each of ten episodes. {'; '.join(words)}. Rows: {rows}."
+    made += f"seeds, each of ten episodes. {'; '.join(words)}. Rows, and cells that have ended: {of(files, tables)}."
     return f"{table(chosen)}\n\n{made}"
 
 

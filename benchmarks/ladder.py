@@ -16,7 +16,7 @@ from learning.curves import curve, difference, spread
 from matplotlib import pyplot
 from scipy import stats
 
-from delayrl.bench.results import read_table
+from delayrl.bench.results import Collected, read_table
 from delayrl.report import statistics
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
@@ -43,19 +43,27 @@ GOALS = [
 def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     """Draw the curves; return the tables of all arms, with what made them, and of the goals."""
     results: list[Result] = []
-    for collected in map(read_table, files):
+    tables = [read_table(file) for file in files]
+    for collected in tables:
         cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
     every = [used for file in files for used in trained_with(file)]
     words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
-    rows = ", ".join(f"`benchmarks/results/{file.name}`" for file in files)
     made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
-    made += f"seeds, each of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows: {rows}."
+    made += f"seeds, each of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows, and cells that have ended: "
+    made += f"{of(files, tables)}."
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
     slower = update_times(files[0].parent / "arms.jsonl")
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
+
+
+def of(files: list[Path], tables: list[Collected]) -> str:
+    """Name files of rows, with how many cells of each grid have ended."""
+    states = [[progress.state for _, progress in table.standing] for table in tables]
+    counted = (f"{of_grid.count('done')} of {len(of_grid)}" for of_grid in states)
+    return ", ".join(f"`benchmarks/results/{file.name}` ({n})" for file, n in zip(files, counted, strict=True))
 
 
 def trained_with(file: Path) -> list[dict[str, Any]]:
