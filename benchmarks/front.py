@@ -29,7 +29,7 @@ SEEDS = 5
 COLOURS = {
     "`sac`, no delay": "#8c8c8c",
     "`any-age`": "#8250df",
-    "`vdpo`": "#1f6feb",
+    "`vdpo` †": "#1f6feb",
     "`lifting`": "#bc4c00",
     "`bpql`": "#1a7f37",
     "`bpql`, `critic_norm=layer`": "#6fdd8b",
@@ -49,7 +49,8 @@ def section(files: list[Path], pictures: Path) -> str:
     steps = " and ".join(f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
     made = f"Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other number is given. In "
     made += "brackets the 95 % interval of the mean; below it the return at the end, ± the standard deviation over "
-    made += f"seeds, each of ten episodes. {'; '.join(words)}. Rows, and cells that have ended: {of(files, tables)}."
+    made += "seeds, each of ten episodes. † reads the true state while it trains; VDPO has `--tokens 1280`. "
+    made += f"{'; '.join(words)}. Rows, and cells that have ended: {of(files, tables)}."
     return f"{table(chosen)}\n\n{made}"
 
 
@@ -71,8 +72,9 @@ def short(env: str) -> str:
 
 
 def name(result: Result) -> str:
-    """Return the arm in words, without the options of its budget."""
-    return ", ".join(word for word in arm(result.condition).split(", ") if word.strip("`").split("=")[0] not in BUDGET)
+    """Return the arm in words, without the options of its budget; † marks what reads the true state."""
+    words = [word for word in arm(result.condition).split(", ") if word.strip("`").split("=")[0] not in BUDGET]
+    return ", ".join(words) + (" †" if result.privileged else "")
 
 
 def table(chosen: Chosen) -> str:
