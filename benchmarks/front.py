@@ -105,8 +105,10 @@ def draw(chosen: Chosen, out: Path) -> None:
     for axes, case in zip(panels.flat, CASES, strict=True):
         for label, colour in COLOURS.items():
             if (label, case) in chosen:
-                lines[label.replace("`", "")] = curve(axes, *chosen[label, case].curves, colour)
+                lines[label] = curve(axes, *chosen[label, case].curves, colour)
         axes.set_title(f"{short(case[0])}, {case[1]} steps late")
-    figure.legend(lines.values(), lines, loc="outside lower center", ncols=5, frameon=False)
+    labels = [label for label in COLOURS if label in lines]
+    names = [label.replace("`", "") for label in labels]
+    figure.legend([lines[label] for label in labels], names, loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)
