@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from ladder import arm, of, spread, trained_with
+from ladder import arm, made_on, rows_of, spread, trained_with
 from learning.curves import curve
 from matplotlib import pyplot
 from which import BUDGET, ended
@@ -45,12 +45,16 @@ def section(files: list[Path], pictures: Path) -> str:
     chosen = choose([r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()])
     draw(chosen, pictures / "result.png")
     used = [versions for file in files for versions in trained_with(file)]
-    words = dict.fromkeys(f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in used)
     steps = " and ".join(f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
-    made = f"Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other number is given. In "
-    made += "brackets the 95 % interval of the mean; below it the return at the end, ± the standard deviation over "
-    made += "seeds, each of ten episodes. † reads the true state while it trains; VDPO has `--tokens 1280`. "
-    made += f"{'; '.join(words)}. Rows, and cells that have ended: {of(files, tables)}."
+    made = f"Δ is the delay in steps. Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other "
+    made += (
+        "number is given. In brackets is the 95 % interval of the mean, below it the return at the end, ± the standard "
+    )
+    made += (
+        "deviation over seeds, each of ten episodes. † reads the true state while it trains. VDPO has `--tokens 1280`. "
+    )
+    made += "With `critic_norm=layer`, BPQL's critics have layer normalisation, as any-age's have. "
+    made += f"{made_on(used)} {rows_of(files, tables)}"
     return f"{table(chosen)}\n\n{made}"
 
 

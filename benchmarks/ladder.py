@@ -50,20 +50,25 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
     every = [used for file in files for used in trained_with(file)]
-    words = [f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in every]
     made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
-    made += f"seeds, each of ten episodes. {'; '.join(dict.fromkeys(words))}. Rows, and cells that have ended: "
-    made += f"{of(files, tables)}."
+    made += f"seeds, each of ten episodes. {made_on(every)} {rows_of(files, tables)}"
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
     slower = update_times(files[0].parent / "arms.jsonl")
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
 
 
-def of(files: list[Path], tables: list[Collected]) -> str:
-    """Name files of rows, with how many cells of each grid have ended."""
+def made_on(used: list[dict[str, Any]]) -> str:
+    """Write the hardware and libraries that rows were made with, each once."""
+    words = dict.fromkeys(f"{v['cores']} x86 cores, jax {v['jax']}, MuJoCo {v['mujoco']}" for v in used)
+    return f"{'; '.join(words)}."
+
+
+def rows_of(files: list[Path], tables: list[Collected]) -> str:
+    """Write where rows are, with how many cells of each grid have ended."""
     states = [[progress.state for _, progress in table.standing] for table in tables]
     counted = (f"{of_grid.count('done')} of {len(of_grid)}" for of_grid in states)
-    return ", ".join(f"`benchmarks/results/{file.name}` ({n})" for file, n in zip(files, counted, strict=True))
+    named = (f"`benchmarks/results/{file.name}` ({n})" for file, n in zip(files, counted, strict=True))
+    return f"Rows, and cells that have ended: {', '.join(named)}."
 
 
 def trained_with(file: Path) -> list[dict[str, Any]]:

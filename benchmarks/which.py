@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ladder import of
+from ladder import rows_of
 
 from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
@@ -26,7 +26,7 @@ def section(files: list[Path]) -> str:
     """Return a Markdown table with a line for each task and delay on which at least two agents have ended."""
     tables = [read_table(file) for file in files]
     results = [r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()]
-    return f"{markdown_table(HEAD, lines(results))}\n\nRows, and cells that have ended: {of(files, tables)}."
+    return f"{markdown_table(HEAD, lines(results))}\n\n{rows_of(files, tables)}"
 
 
 def lines(results: Iterable[Result]) -> list[list[str]]:

@@ -20,7 +20,7 @@ NAN = math.nan
 SMOOTHED = 5
 """Evaluations that a smoothed curve averages."""
 REPETITIONS = 20_000
-"""Of a bootstrap. With 5,000, chance moved bounds of five runs, which lie at half a percent, by a whole step."""
+"""Resamples of a bootstrap. With 5,000, chance decided the bounds of five runs, which lie at half a percent."""
 FEWEST = 5
 """With fewer runs of either of two agents, an interval of which is better would mislead."""
 
