@@ -13,6 +13,7 @@ from typing import Any
 import forecast
 import front
 import ladder
+import lost
 import matplotlib
 import numpy as np
 import which
@@ -360,9 +361,11 @@ def main() -> None:
         arms, goals = ladder.sections(rows, images / "ladder.png")
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
         insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
-    result = front.section([HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "any-age-ladder")], images)
+    rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "any-age-ladder")]
+    result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)
+    insert(root / "docs" / "which-agent.md", "lost", lost.section(rows))
     if forecast.OUT.exists():
         insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())
     if list((HERE / "results" / "times").glob("*.jsonl")):

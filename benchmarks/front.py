@@ -13,6 +13,7 @@ from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
 from delayrl.report.wording import interval, normalised
+from delayrl.run.condition import Condition
 
 Case = tuple[str, int]
 Chosen = dict[tuple[str, Case], Result]
@@ -76,9 +77,14 @@ def short(env: str) -> str:
 
 
 def name(result: Result) -> str:
-    """Return the arm in words, without the options of its budget; † marks what reads the true state."""
-    words = [word for word in arm(result.condition).split(", ") if word.strip("`").split("=")[0] not in BUDGET]
-    return ", ".join(words) + (" †" if result.privileged else "")
+    """Return the arm in words."""
+    return in_words(result.condition, result.privileged)
+
+
+def in_words(condition: Condition, privileged: bool) -> str:
+    """Return an arm in words, without the options of its budget; † marks what reads the true state."""
+    words = [word for word in arm(condition).split(", ") if word.strip("`").split("=")[0] not in BUDGET]
+    return ", ".join(words) + (" †" if privileged else "")
 
 
 def table(chosen: Chosen) -> str:
