@@ -66,6 +66,8 @@ def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert list(result) == ["agent", "env", "delay", "episodes", "mean_return", "std_return", "returns"]
     assert (result["agent"], result["delay"], len(result["returns"])) == ("vdpo", 3, 3)
     assert result["mean_return"] == pytest.approx(sum(result["returns"]) / 3)
+    main(["evaluate", str(run), "--episodes", "3", "--seed", "1"])
+    assert capsys.readouterr().out.endswith(f" over 3 episodes, the lowest {min(result['returns']):.1f}\n")
     main(["evaluate", str(run), "--episodes", "3", "--delay", "1"])
     assert "delay 1" in capsys.readouterr().out
 

@@ -36,7 +36,8 @@ def run(given: argparse.Namespace) -> None:
         print(json.dumps(result))
         return
     returns = f"return {result['mean_return']:.1f} ± {result['std_return']:.1f} over {result['episodes']} episodes"
-    print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}")
+    lowest = f"the lowest {min(result['returns']):.1f}"
+    print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}, {lowest}")
 
 
 def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
@@ -54,8 +55,9 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
     if given.json:
         print(json.dumps(results))
     else:
-        rows = [[r["delay"], f"{r['mean_return']:.1f}", f"{r['std_return']:.1f}", r["episodes"]] for r in results]
-        print_table(["delay", "mean return", "std", "episodes"], rows)
+        values = [(r, r["mean_return"], r["std_return"], min(r["returns"])) for r in results]
+        rows = [[r["delay"], *(f"{value:.1f}" for value in own), r["episodes"]] for r, *own in values]
+        print_table(["delay", "mean return", "std", "lowest", "episodes"], rows)
     figure = given.run / "delays.png"
     against_delay(results, figure)
     print(f"figure: {figure}", file=sys.stderr)
