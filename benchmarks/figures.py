@@ -367,7 +367,7 @@ def main() -> None:
         insert(root / page, "result", result)
     insert(root / "docs" / "which-agent.md", "lost", lost.section(rows))
     if forecast.OUT.exists():
-        insert(root / "docs" / "algorithms" / "any-age.md", "forecast", forecast.section())
+        insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
     if list((HERE / "results" / "times").glob("*.jsonl")):
         text = times.section(HERE / "results" / "times", images / "times.png")
         insert(root / "docs" / "performance.md", "times", text)
