@@ -365,7 +365,7 @@ def main() -> None:
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)
-    insert(root / "docs" / "which-agent.md", "lost", lost.section(rows))
+    insert(root / "docs" / "which-agent.md", "lost", lost.section(rows, images / "lost.png"))
     if forecast.OUT.exists():
         insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
     if list((HERE / "results" / "times").glob("*.jsonl")):

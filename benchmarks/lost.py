@@ -13,12 +13,15 @@ from typing import NamedTuple
 import numpy as np
 from front import COLOURS, STEPS, in_words
 from ladder import rows_of
+from matplotlib import pyplot
 
 from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
 from delayrl.run.cell import Cell
 
 ENV = "HalfCheetah-v5"
+DRAWN = 25
+"""The delay of the picture's policies."""
 LOST = 0.7
 """An episode is lost if it returns less than this part of the best of its evaluation, both above a random policy's."""
 HEAD = ("Δ", "policy", "seeds", "mean return", "lost episodes", "mean of the others", "change")
@@ -33,12 +36,13 @@ Runs = dict[int, dict[int, list[float]]]
 """Returns of the episodes, by seed and step."""
 
 
-def section(files: list[Path]) -> str:
-    """Return the table, with where its rows are. Of a policy that two files hold, each seed counts once."""
+def section(files: list[Path], picture: Path) -> str:
+    """Draw episodes; return the table, with where its rows are. Of a policy in two files, each seed counts once."""
     known: dict[tuple[int, str], Runs] = defaultdict(dict)
     for file in files:
         for policy, runs in episodes(file).items():
             known[policy] |= runs
+    draw({words: known[DRAWN, words] for words in COLOURS if (DRAWN, words) in known}, picture)
     chance = [x for evaluations in known.pop((0, CHANCE)).values() for x in evaluations[max(evaluations)]]
     lines = [(delay, words, runs, measure(runs, float(np.mean(chance)))) for (delay, words), runs in known.items()]
     lines.sort(key=lambda line: (line[0], -line[3].mean))
@@ -61,6 +65,25 @@ def episodes(file: Path) -> dict[tuple[int, str], Runs]:
                 words += ", its reference without delay" if policy == "reference" else ""
                 known[condition.delay, words][seed][step].append(value)
     return known
+
+
+def draw(policies: dict[str, Runs], out: Path) -> None:
+    """Draw a panel for each policy: a dot for the return of each episode, in one colour for each seed."""
+    rows = -(-len(policies) // 3)
+    shape = {"figsize": (10, 3 * rows), "sharex": True, "sharey": True, "squeeze": False, "layout": "constrained"}
+    figure, panels = pyplot.subplots(rows, 3, **shape)
+    for axes, (words, runs) in zip(panels.flat, policies.items(), strict=False):
+        for number, run in enumerate(runs.values()):
+            steps = np.repeat([step / 1000 for step in run], [len(x) for x in run.values()])
+            axes.plot(steps, np.concatenate([*run.values()]), ".", color=f"C{number % 10}", markersize=3, alpha=0.5)
+        axes.set_title(words.replace("`", ""), fontsize=10)
+        axes.grid(alpha=0.25)
+    for axes in panels.flat[len(policies) :]:
+        axes.set_axis_off()
+    figure.supxlabel("thousand environment steps")
+    figure.supylabel("return of an episode")
+    figure.savefig(out, dpi=110)
+    pyplot.close(figure)
 
 
 class Found(NamedTuple):

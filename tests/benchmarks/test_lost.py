@@ -56,7 +56,7 @@ def test_the_table_has_each_policy_that_has_ended(tmp_path: Path, monkeypatch: p
         ({"agent": "bpql", "delay": 25}, "running", {"agent": high}),
         ({"agent": "bpql", "delay": 25, "overrides": {"batch_size": 128}}, "done", {"agent": high}),
     )
-    _, _, *lines = lost.section([file, file]).strip().splitlines()
+    _, _, *lines = lost.section([file, file], tmp_path / "lost.png").strip().splitlines()
     assert lines == [
         "| 25 | `vdpo` †, its reference without delay | 1 | 70 | 25 % | 90 | 40 |",
         "| 25 | `vdpo` † | 1 | 50 | 0 % | 50 | 0 |",
