@@ -148,6 +148,10 @@ def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert [r["delay"] for r in results] == [0, 1, 2, 3]
     assert results[0]["mean_return"] == returns[0]
     assert (run.path / "delays.png").stat().st_size > 5000
+    cli.main(["evaluate", str(run.path), "--sweep", "--episodes", "2"])
+    titles, *_, last = capsys.readouterr().out.split("\n")[:-1]
+    assert titles.split() == ["delay", "mean", "return", "std", "lowest", "episodes"]
+    assert last.split()[3] == f"{min(results[-1]['returns']):.1f}"
     with pytest.raises(SystemExit):
         cli.main(["evaluate", str(run.path), "--sweep", "--delay", "2"])
 

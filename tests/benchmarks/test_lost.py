@@ -1,38 +1,22 @@
 """The table that says how many episodes are lost."""
 
-import json
-import sqlite3
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
 
-import lost
+import lost  # noqa: E402
+from synthetic import Standing, standing  # noqa: E402
 
-from delayrl.bench.results import TABLES
+from delayrl.bench.results import Collected  # noqa: E402
+from delayrl.errors import DelayRLError  # noqa: E402
 
-LEARNER = {"env": "HalfCheetah-v5", "preset": "matched", "protocol": "corrected", "steps": 100_000, "overrides": {}}
-CHANCE = {"agent": "random", "delay": 0, "steps": 10_000}
-LATE = {"agent": "vdpo", "delay": 25, "overrides": {"precision": "bfloat16", "tokens": 1280}}
-
-
-def write(file: Path, *cells: tuple[dict[str, Any], str, dict[str, dict[int, list[float]]]]) -> Path:
-    """Write a table of cells of one seed: what was trained, its state, and returns by policy and step."""
-    with sqlite3.connect(file) as table:
-        table.executescript(TABLES)
-        for number, (changes, state, policies) in enumerate(cells):
-            cell = LEARNER | changes | {"seeds": [0]}
-            shared = {"privileged": cell["agent"] == "vdpo"}
-            table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, 0, 0)", (str(number), number, json.dumps(cell), state))
-            table.execute("INSERT INTO runs VALUES (?, ?, 0, ?, '{}', '{}')", (number, str(number), json.dumps(shared)))
-            for policy, evaluations in policies.items():
-                for step, returns in evaluations.items():
-                    rows = [(number, step, policy, i, 0, x, 1, "{}") for i, x in enumerate(returns)]
-                    table.executemany("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
-    return file
+ENV, HALF, END = "HalfCheetah-v5", 75_000, 100_000
+HIGH, LOW = {HALF: [9000.0, 1000.0], END: [9000.0, 9000.0]}, {HALF: [50.0, 50.0], END: [50.0, 50.0]}
+EARLY = {25_000: [-5000.0, 5000.0]}
 
 
 def test_an_episode_is_lost_below_0_7_of_the_best_above_chance() -> None:
@@ -42,22 +26,62 @@ def test_an_episode_is_lost_below_0_7_of_the_best_above_chance() -> None:
     assert found.lost == pytest.approx(1 / 6)
     assert found.others == pytest.approx((900 + 600 + 3 * 200) / 5)
     assert (found.mean, found.change) == pytest.approx(((2099 + 600) / 6, 2099 / 3 - 200))
+    assert lost.measure({0: {75: [1499.0, 1500], 100: [4000.0, 4000]}}, 0).low == 0.25
+
+
+def cell(agent: str, delay: int | str, runs: Any, env: str = ENV, **changes: Any) -> tuple[Standing, Any]:
+    """A cell of `matched`, with returns of its seeds by policy and step."""
+    id = f"{agent} {delay} {env} {changes}"
+    return standing(agent, env, delay, 1, id, **({"steps": END, "preset": "matched"} | changes)), runs
+
+
+def collected(*cells: tuple[Standing, Any]) -> Collected:
+    """The table of some cells."""
+    rows = [
+        {"cell": made.id, "seed": seed, "policy": policy, "step": step, "return": value, "privileged": privileged}
+        for (made, _), runs in cells
+        for privileged in [made.condition.agent == "vdpo"]
+        for seed, policies in runs.items()
+        for policy, evaluations in policies.items()
+        for step, returns in evaluations.items()
+        for value in returns
+    ]
+    return Collected(rows, [made for made, _ in cells], [], [])
 
 
 def test_the_table_has_each_policy_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not what still runs, nor arms of other batches; a reference has a line of its own; the best comes first."""
-    monkeypatch.setattr(lost, "rows_of", lambda *_: "")
-    monkeypatch.setattr(lost, "read_table", lambda _: None)
-    high, low = {75_000: [90.0, 10.0], 100_000: [90.0, 90.0]}, {75_000: [50.0, 50.0], 100_000: [50.0, 50.0]}
-    file = write(
-        tmp_path / "some.sqlite",
-        (CHANCE, "done", {"agent": {1: [9.0], 10_000: [0.0]}}),
-        (LATE, "done", {"agent": low, "reference": high}),
-        ({"agent": "bpql", "delay": 25}, "running", {"agent": high}),
-        ({"agent": "bpql", "delay": 25, "overrides": {"batch_size": 128}}, "done", {"agent": high}),
+    """By delay, the best first; of two files each seed once; nothing that runs, is shorter, or is another arm or task.
+
+    Chance is the last evaluation of the random policy. With it at -1000, 0.7 of 600 more is more than 100 more.
+    """
+    chance = {0: {"agent": {1: [9e9], 10_000: [-1000.0, -1000.0]}}}
+    first = collected(
+        cell("random", 0, chance, steps=10_000, overrides={"random_steps": 1000}),
+        cell("vdpo", 25, {0: {"agent": EARLY | LOW, "reference": EARLY | HIGH}}, overrides={"tokens": 1280}),
+        cell("bpql", 5, {0: {"agent": {HALF: [-400.0, -600.0], END: [-400.0, -400.0]}}}),
+        cell("any-age", 25, {0: {"agent": HIGH}}, state="running"),
+        cell("bpql", 25, {0: {"agent": HIGH}}, overrides={"batch_size": 128}),
+        cell("bpql", 25, {0: {"agent": HIGH}}, steps=50_000),
+        cell("bpql", "uniform:1:25", {0: {"agent": HIGH}}),
+        cell("bpql", 25, {0: {"agent": HIGH}}, env="Ant-v5"),
+        cell("bpql", 25, {0: {"agent": HIGH}}, preset="small"),
     )
-    _, _, *lines = lost.section([file, file], tmp_path / "lost.png").strip().splitlines()
+    second = collected(cell("vdpo", 25, {1: {"agent": {HALF: [90.0, 90.0], END: [50.0, 50.0]}}}))
+    tables = {"first": first, "second": second}
+    monkeypatch.setattr(lost, "rows_of", lambda *_: "")
+    monkeypatch.setattr(lost, "read_table", lambda file: tables[file.name])
+    _, _, *lines = lost.section([Path(name) for name in tables], tmp_path / "lost.png").strip().splitlines()
     assert lines == [
-        "| 25 | `vdpo` †, its reference without delay | 1 | 70 | 25 % | 90 | 40 |",
-        "| 25 | `vdpo` † | 1 | 50 | 0 % | 50 | 0 |",
+        "| 5 | `bpql` | 1 | -450 | 25 % | 100 % | -400 | 100 |",
+        "| 25 | `vdpo` †, its reference without delay | 1 | 7,000 | 25 % | 25 % | 9,000 | 4,000 |",
+        "| 25 | `vdpo` † | 2 | 60 | 0 % | 100 % | 60 | 20 |",
     ]
+
+
+def test_a_seed_is_not_in_two_cells() -> None:
+    """Else the episodes of two runs would be taken for one."""
+    twice = collected(
+        cell("vdpo", 25, {0: {"agent": LOW}}), cell("vdpo", 25, {0: {"agent": HIGH}}, overrides={"tokens": 1})
+    )
+    with pytest.raises(DelayRLError, match="seed 0 of `vdpo` † at delay 25 is in two cells"):
+        lost.episodes(twice)

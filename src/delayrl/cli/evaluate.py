@@ -55,8 +55,10 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
     if given.json:
         print(json.dumps(results))
     else:
-        values = [(r, r["mean_return"], r["std_return"], min(r["returns"])) for r in results]
-        rows = [[r["delay"], *(f"{value:.1f}" for value in own), r["episodes"]] for r, *own in values]
+        rows = []
+        for r in results:
+            values = (r["mean_return"], r["std_return"], min(r["returns"]))
+            rows.append([r["delay"], *(f"{value:.1f}" for value in values), r["episodes"]])
         print_table(["delay", "mean return", "std", "lowest", "episodes"], rows)
     figure = given.run / "delays.png"
     against_delay(results, figure)
