@@ -26,6 +26,8 @@ from delayrl.run.condition import Condition
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,480."""
 BASE, WHOLE = "`bpql`", "`any-age`"
+TWICE = "`any-age`, `batch_size=128`, `updates=2`"
+"""As much arithmetic as WHOLE: half of the batch, two updates a step."""
 GOALS = [
     (WHOLE, "`bpql`, its released settings", "1.5"),
     (WHOLE, BASE, ""),
@@ -36,6 +38,14 @@ GOALS = [
     ("`any-age`, `batch_size=128`", "`bpql`, `batch_size=128`", ""),
     (WHOLE, "`sac`, no delay, `critic_norm=layer`", "0.75"),
     (WHOLE, "`sac`, no delay", ""),
+    (TWICE, "`bpql`, its released settings", "1.5"),
+    (TWICE, "`bpql`, `batch_size=128`, `critic_norm=layer`, `updates=2`", "1.15"),
+    (TWICE, "`bpql`, `batch_size=128`, `updates=2`", ""),
+    (TWICE, "`any-age`, `batch_size=128`", ""),
+    (TWICE, WHOLE, ""),
+    (TWICE, "`sac`, no delay, `batch_size=128`, `critic_norm=layer`, `updates=2`", "0.75"),
+    (TWICE, "`sac`, no delay, `critic_norm=layer`", ""),
+    (TWICE, "`sac`, no delay", ""),
 ]
 """Two arms, and the ratio of their returns that is aimed at."""
 
@@ -98,7 +108,7 @@ def arm(condition: Condition) -> str:
     words = [f"`{condition.agent}`", *(["no delay"] if condition.delay == 0 else [])]
     if condition.preset != "matched":
         return ", ".join([*words, "its released settings" if condition.preset == "paper" else "preset `small`"])
-    return ", ".join([*words, *(f"`{k}={v}`" for k, v in condition.overrides.items() if k != "precision")])
+    return ", ".join([*words, *(f"`{k}={v}`" for k, v in sorted(condition.overrides.items()) if k != "precision")])
 
 
 def compared_with(result: Result) -> str:
