@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from learning.curves import curve, difference, spread
 from matplotlib import pyplot
+from matplotlib.colors import to_hex
 from scipy import stats
 
 from delayrl.bench.results import Collected, read_table
@@ -180,7 +181,9 @@ def draw(arms: list[Result], out: Path) -> None:
     """Draw the curves of the arms in one picture."""
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
     for number, result in enumerate(arms):
-        curve(axes, *result.curves, f"C{number % 10}").set_label(name(result).replace("`", ""))
+        curve(axes, *result.curves, to_hex(pyplot.get_cmap("tab20")(number % 20))).set_label(
+            name(result).replace("`", "")
+        )
     axes.set_title("HalfCheetah-v5, 25 steps late unless said")
     axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
     axes.legend(frameon=False, fontsize=8)
