@@ -5,6 +5,7 @@ begin with the same random actions, and with the same actor if they have one enc
 """
 
 import contextlib
+import itertools
 import json
 import sqlite3
 from collections.abc import Mapping
@@ -180,10 +181,9 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
 def draw(arms: list[Result], out: Path) -> None:
     """Draw the curves of the arms in one picture."""
     figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
-    for number, result in enumerate(arms):
-        curve(axes, *result.curves, to_hex(pyplot.get_cmap("tab20")(number % 20))).set_label(
-            name(result).replace("`", "")
-        )
+    colours = [to_hex(pyplot.get_cmap("tab20")(number)) for number in range(20)]
+    for result, colour in zip(arms, itertools.cycle(colours)):
+        curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
     axes.set_title("HalfCheetah-v5, 25 steps late unless said")
     axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
     axes.legend(frameon=False, fontsize=8)
