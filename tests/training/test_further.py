@@ -17,7 +17,7 @@ from conftest import quick
 from delayrl.cli.main import main
 from delayrl.errors import StoppedError
 from delayrl.play.run import Run
-from delayrl.training.resume import fitting, part_of
+from delayrl.training.resume import fitting, parts_of
 from short_runs import arrays, newest, train
 
 module = import_module("delayrl.training.train")  # `delayrl.training` may show its function under that name
@@ -245,16 +245,58 @@ def test_of_a_deeper_network_no_part_is_taken() -> None:
     """Two blocks of three would be no network that anyone trained. Counters and optimisers begin anew."""
     shallow = {"encoder.blocks.0.w": np.zeros(2), "steps": np.zeros((), int), "a_opt_state.0.mu": np.zeros(2)}
     deep = shallow | {"encoder.blocks.1.w": np.zeros(2)}
-    assert fitting(shallow, shallow) == (["encoder.blocks"], [])
-    assert fitting(shallow, deep) == fitting(deep, shallow) == ([], ["encoder.blocks"])
+    assert fitting(shallow, shallow) == ["encoder.blocks"]
+    assert fitting(shallow, deep) == fitting(deep, shallow) == []
 
 
 def test_parts_of_a_state() -> None:
-    names = ["critic.0.2.w", "reference.actor.1.b", "log_temperature", "encoder.position", "encoder.blocks.0.out.w"]
-    assert [part_of(name) for name in names] == [
-        "critic",
-        "reference.actor",
-        "log_temperature",
-        "encoder",
-        "encoder.blocks",
-    ]
+    """A number is a part of its own, unless what it is in has arrays beside it."""
+    names = ["critic.0.2.w", "reference.actor.1.b", "encoder.position", "encoder.blocks.0.out.w", "moments.mean"]
+    numbers = ["log_temperature", "reference.log_temperature", "moments.number"]
+    state = {name: np.zeros(2) for name in names} | {name: np.zeros(()) for name in numbers}
+    assert parts_of(state) == {
+        "critic": ["critic.0.2.w"],
+        "reference.actor": ["reference.actor.1.b"],
+        "encoder": ["encoder.position"],
+        "encoder.blocks": ["encoder.blocks.0.out.w"],
+        "moments": ["moments.mean", "moments.number"],
+        "log_temperature": ["log_temperature"],
+        "reference.log_temperature": ["reference.log_temperature"],
+    }
+
+
+def test_a_temperature_alone_is_not_taken() -> None:
+    """Nor beside another agent's network."""
+    fresh = {name: np.zeros(2) for name in ("actor.0.w", "reference.actor.0.w")}
+    fresh |= {name: np.zeros(()) for name in ("log_temperature", "reference.log_temperature")}
+    other = fresh | {"reference.actor.0.w": np.zeros(3)}
+    assert fitting(fresh, other) == ["actor", "log_temperature"]
+    assert fitting(fresh, {name: x for name, x in other.items() if name != "actor.0.w"}) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "taken"),
+    [
+        ("bpql", "lifting", "delayed.actor, delayed.critic, delayed.target, reference.critic, reference.target"),
+        ("lifting", "bpql", "actor, critic, target, log_temperature; new: no network"),
+        ("lifting", "vdpo", "reference.actor, reference.critic, reference.target, reference.log_temperature"),
+    ],
+)
+def test_both_agents_of_lifting(
+    old: str, new: str, taken: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its delayed one fits BPQL whole, and either of its agents gives both actor and critics."""
+    source = train(old, tmp_path / "old", steps=250)
+    begun = train(new, tmp_path / "new", steps=250, start_from=source, progress=True)
+    assert f"taken over: {taken}" in capsys.readouterr().err
+    if (old, new) == ("lifting", "bpql"):
+        before, after = arrays(source), arrays(begun)
+        moved = {agent: np.abs(after["critic.0.0.w"] - before[f"{agent}.critic.0.0.w"]).max() for agent in ("delayed", "reference")}
+        assert moved["delayed"] < moved["reference"] / 2
+
+
+def test_of_an_agent_with_other_views_nothing_is_taken(tmp_path: Path) -> None:
+    """A temperature fits every agent, and is no network."""
+    old = train("a-sac", tmp_path / "old", steps=200)
+    with pytest.raises(delayrl.DelayRLError, match="old has no network that fits: it lacks"):
+        train("vdpo", tmp_path / "new", start_from=old)

@@ -28,6 +28,8 @@ COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
 """The columns of a replay that have one entry for each row."""
 COUNTS = ("rows", "steps", "lost")
 KEPT = "the last good checkpoint is kept"
+RENAMED = (("", ""), ("delayed.", ""), ("reference.", ""), ("", "delayed."), ("", "reference."))
+"""Beginnings of names in another run, and here, in the order in which they are tried: agents inside agents."""
 
 
 def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
@@ -98,41 +100,59 @@ def _nothing_stored(step: int, learner: Learner, actors: list[Actor]) -> TrainSt
 
 def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:
     """Return a fresh agent with the networks of another run that fit. Raises DelayRLError if none does."""
-    arrays = source.arrays("agent")
+    stored = source.arrays("agent")
     fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
-    renamed: Arrays = {}
-    for name, array in arrays.items():  # a reference is an agent itself; normalisation keeps the agent in `agent`
-        outer = "agent." * name.startswith("agent.")
-        inner = name.removeprefix(outer).removeprefix("reference.")
-        renamed |= {f"{outer}reference.{inner}": array, f"{outer}{inner}": array}
-    arrays = renamed | arrays
-    taken, left = fitting(fresh, arrays)
+    parts, filled = parts_of(fresh), Arrays()
+    for old, new in RENAMED:
+        offered = _renamed(stored, old, new)
+        names = [name for part in fitting(fresh, offered) for name in parts[part]]
+        filled = {name: offered[name] for name in names} | filled
+    taken = [part for part, names in parts.items() if names[0] in filled]
+    left = ", ".join(part for part in parts if part not in taken)
     if not set(taken) - {"moments"}:
         where = source.path.parents[1]
-        raise DelayRLError(f"{where} has no network that fits: it lacks {', '.join(left)}, or has them in other sizes")
-    note(f"taken over: {', '.join(taken)}; new: {', '.join(left) or 'no network'}, and the optimisers")
-    names = [name for name, leaf in fresh.items() if is_learned(name, leaf) and part_of(name) in taken]
-
-    def filled(leaf: Any, name: str) -> Any:
-        return jnp.broadcast_to(arrays[name], leaf.shape) if name in names else leaf
-
+        raise DelayRLError(f"{where} has no network that fits: it lacks {left}, or has them in other sizes")
+    note(f"taken over: {', '.join(taken)}; new: {left or 'no network'}, and the optimisers")
     leaves, form = jax.tree.flatten(agent)
-    return jax.tree.unflatten(form, [filled(leaf, name) for leaf, name in zip(leaves, fresh, strict=True)])
+    pairs = zip(leaves, fresh, strict=True)
+    return jax.tree.unflatten(form, [jnp.broadcast_to(filled.get(name, leaf), leaf.shape) for leaf, name in pairs])
 
 
-def fitting(fresh: Arrays, stored: Arrays) -> tuple[list[str], list[str]]:
-    """Return the parts of an agent's state that stored arrays can fill, and those that they cannot.
+def _renamed(stored: Arrays, old: str, new: str) -> Arrays:
+    """Return the arrays whose names begin with `old`, under names that begin with `new` instead."""
+    renamed: Arrays = {}
+    for name, array in stored.items():
+        outer = "agent." * name.startswith("agent.")  # where normalisation keeps the agent
+        if name.startswith(outer + old):
+            renamed[outer + new + name.removeprefix(outer + old)] = array
+    return renamed
 
-    A part is a network or another piece that is of use only whole. Optimisers and counters are never taken over.
+
+def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
+    """Return the parts of an agent's state that stored arrays can fill; a lone number only beside a network.
+
+    Optimisers and counters are in no part: they are never taken over.
     """
-    parts: dict[str, bool] = {}
-    for name, leaf in fresh.items():
-        if is_learned(name, leaf):
-            fits = name in stored and stored[name].shape == leaf.shape
-            parts[part_of(name)] = parts.get(part_of(name), True) and fits
+    parts = parts_of(fresh)
     deeper = {part_of(name) for name in stored.keys() - fresh.keys() if any(word.isdigit() for word in name.split("."))}
-    taken = [name for name, fits in parts.items() if fits and name not in deeper]
-    return taken, [name for name in parts if name not in taken]
+
+    def fits(name: str) -> bool:
+        return name in stored and stored[name].shape == fresh[name].shape
+
+    taken = [part for part, names in parts.items() if part not in deeper and all(map(fits, names))]
+    networks = {part.rpartition(".")[0] for part in taken if part not in fresh or fresh[part].ndim}
+    return [part for part in taken if part not in fresh or fresh[part].ndim or part.rpartition(".")[0] in networks]
+
+
+def parts_of(state: Arrays) -> dict[str, list[str]]:
+    """Return what an agent has learned: the leaves of each network, and of each number such as a temperature."""
+    learned = {name: leaf for name, leaf in state.items() if is_learned(name, leaf)}
+    parts: dict[str, list[str]] = {}
+    for name in sorted(learned, key=lambda name: learned[name].ndim == 0):  # numbers last
+        part = part_of(name)
+        lone = learned[name].ndim == 0 and part not in parts
+        parts.setdefault(name if lone else part, []).append(name)
+    return parts
 
 
 def is_learned(name: str, leaf: Any) -> bool:
@@ -141,7 +161,7 @@ def is_learned(name: str, leaf: Any) -> bool:
 
 
 def part_of(leaf: str) -> str:
-    """Return the part that a leaf is in: "reference.critic" of "reference.critic.0.1.w"."""
+    """Return the network that an array is in: "reference.critic" of "reference.critic.0.1.w"."""
     names = leaf.split(".")
     first = next((i for i, name in enumerate(names) if name.isdigit()), max(len(names) - 1, 1))
     return ".".join(names[:first])
