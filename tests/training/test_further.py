@@ -291,7 +291,10 @@ def test_both_agents_of_lifting(
     assert f"taken over: {taken}" in capsys.readouterr().err
     if (old, new) == ("lifting", "bpql"):
         before, after = arrays(source), arrays(begun)
-        moved = {agent: np.abs(after["critic.0.0.w"] - before[f"{agent}.critic.0.0.w"]).max() for agent in ("delayed", "reference")}
+        moved = {
+            agent: np.abs(after["critic.0.0.w"] - before[f"{agent}.critic.0.0.w"]).max()
+            for agent in ("delayed", "reference")
+        }
         assert moved["delayed"] < moved["reference"] / 2
 
 
