@@ -28,8 +28,8 @@ COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
 """The columns of a replay that have one entry for each row."""
 COUNTS = ("rows", "steps", "lost")
 KEPT = "the last good checkpoint is kept"
-RENAMED = (("", ""), ("delayed.", ""), ("reference.", ""), ("", "delayed."), ("", "reference."))
-"""Beginnings of names in another run, and here, in the order in which they are tried: agents inside agents."""
+RENAMED = (("", "reference."), ("", "delayed."), ("reference.", ""), ("delayed.", ""), ("", ""))
+"""Beginnings of names in another run, and here: agents inside agents. Where two fit as well, the later one counts."""
 
 
 def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
@@ -103,10 +103,9 @@ def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -
     stored = source.arrays("agent")
     fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
     parts, filled = parts_of(fresh), Arrays()
-    for old, new in RENAMED:
-        offered = _renamed(stored, old, new)
-        names = [name for part in fitting(fresh, offered) for name in parts[part]]
-        filled = {name: offered[name] for name in names} | filled
+    offers = [_renamed(stored, old, new) for old, new in RENAMED]
+    for offered in sorted(offers, key=lambda offered: len(fitting(fresh, offered))):  # what fits best overwrites others
+        filled |= {name: offered[name] for part in fitting(fresh, offered) for name in parts[part]}
     taken = [part for part, names in parts.items() if names[0] in filled]
     left = ", ".join(part for part in parts if part not in taken)
     if not set(taken) - {"moments"}:
@@ -139,9 +138,13 @@ def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
     def fits(name: str) -> bool:
         return name in stored and stored[name].shape == fresh[name].shape
 
+    def agent_of(part: str) -> str:
+        return part.rpartition(".")[0]
+
     taken = [part for part, names in parts.items() if part not in deeper and all(map(fits, names))]
-    networks = {part.rpartition(".")[0] for part in taken if part not in fresh or fresh[part].ndim}
-    return [part for part in taken if part not in fresh or fresh[part].ndim or part.rpartition(".")[0] in networks]
+    numbers = {part for part in taken if part in fresh and fresh[part].ndim == 0}
+    begun = {agent_of(part) for part in taken if part not in numbers}
+    return [part for part in taken if part not in numbers or agent_of(part) in begun]
 
 
 def parts_of(state: Arrays) -> dict[str, list[str]]:
