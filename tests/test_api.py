@@ -26,4 +26,4 @@ def test_where_it_is_imported_from(section: str, path: str) -> None:
 
 def test_what_is_offered_is_on_the_page() -> None:
     shown = {path.rpartition(".")[2] for _, path in NAMES}
-    assert set(delayrl.__all__) - shown == {"AGENTS", "DelayRLError"}
+    assert set(delayrl.__all__) - shown == {"AGENTS", "DelayRLError", "DelayWarning", "StoppedError"}

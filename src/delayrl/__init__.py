@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from delayrl.deploy.export import export_run as export_run
     from delayrl.envs import make as make
     from delayrl.errors import DelayRLError as DelayRLError
+    from delayrl.errors import DelayWarning as DelayWarning
+    from delayrl.errors import StoppedError as StoppedError
     from delayrl.play.evaluation import evaluate as evaluate
     from delayrl.play.evaluation import sweep as sweep
     from delayrl.play.policy import Policy as Policy
@@ -38,6 +40,8 @@ _HOME = {
     "AugmentedObservation": "wrappers",
     "AugmentedVectorObservation": "wrappers",
     "DelayRLError": "errors",
+    "DelayWarning": "errors",
+    "StoppedError": "errors",
     "Delay": "delays",
     "Delayed": "wrappers",
     "DelayedVector": "wrappers",

@@ -40,6 +40,8 @@ ELSEWHERE = {
     "normalize": "observation_norm",
     "from": "start_from",
     "from_": "start_from",
+    "quiet": "progress",
+    "verbose": "progress",
 }
 """Options of other libraries and functions, and what they are called here."""
 

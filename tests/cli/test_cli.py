@@ -60,16 +60,26 @@ def test_a_delay_in_time(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == (out, "")
 
 
-def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["evaluate", str(run), "--episodes", "3", "--seed", "1", "--json"])
     result = json.loads(capsys.readouterr().out)
-    assert list(result) == ["agent", "env", "delay", "episodes", "mean_return", "std_return", "returns"]
+    assert list(result) == ["agent", "env", "delay", "step", "episodes", "mean_return", "std_return", "returns"]
     assert (result["agent"], result["delay"], len(result["returns"])) == ("vdpo", 3, 3)
     assert result["mean_return"] == pytest.approx(sum(result["returns"]) / 3)
     main(["evaluate", str(run), "--episodes", "3", "--seed", "1"])
     assert capsys.readouterr().out.endswith(f" over 3 episodes, the lowest {min(result['returns']):.1f}\n")
     main(["evaluate", str(run), "--episodes", "3", "--delay", "1"])
-    assert "delay 1" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "delay 1" in out
+    assert not err
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(run, unfinished)
+    config = json.loads((run / "config.json").read_text())
+    config["schedule"]["steps"] = 1000
+    (unfinished / "config.json").write_text(json.dumps(config))
+    main(["evaluate", str(unfinished), "--episodes", "1"])
+    assert "is not finished: this is its policy after 240 of 1,000 steps" in capsys.readouterr().err
+    assert "does not fit the env given" in refused(capsys, "evaluate", str(run), "--env", "Pendulum-v1")
 
 
 def watch(*words: object) -> subprocess.CompletedProcess[str]:
@@ -271,6 +281,14 @@ def test_bad_run_folders(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "cut or changed" in refused(capsys, "evaluate", str(broken))
     (broken / "config.json").write_text("{")
     assert "damaged" in refused(capsys, "evaluate", str(broken))
+
+
+def test_runs_tells_the_steps_of_one_without_evaluations(run: Path, tmp_path: Path, capsys) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "rows.jsonl").unlink()
+    main(["runs", str(tmp_path), "--json"])
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["step"], row["steps"], row["return"]) == (240, 240, None)
 
 
 def test_stopped_run_goes_on(tmp_path: Path) -> None:

@@ -180,6 +180,8 @@ def test_what_cannot_be_adapted(tmp_path: Path) -> None:
         with pytest.raises(DelayRLError, match=words) as error:
             adapt(act, env)
         assert "\n" not in str(error.value)
+    with pytest.raises(DelayRLError, match="adapt takes a function of what the environment shows"):
+        adapt(delayed, act)  # type: ignore[arg-type]
     with pytest.raises(DelayRLError, match="trained on AugmentedObservation"):
         export_layers([], act, delayed, tmp_path / "bundle")
     lopsided = RescaleAction(gym.make("Reacher-v5"), np.float32(0), np.float32(1))

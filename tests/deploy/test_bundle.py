@@ -5,6 +5,7 @@ import os
 import pickle
 import shutil
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from delayrl.cli.main import main
-from delayrl.deploy import load_bundle
+from delayrl.deploy import Bundle, load_bundle
 from delayrl.deploy.backends.network import parse
 from delayrl.deploy.export import bundle_files
 from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, read_files, seal, write_files
@@ -92,6 +93,23 @@ def test_no_bundle(tmp_path: Path, original: Path) -> None:
     refused(original / WEIGHTS, "not a folder")
     with pytest.raises(DelayRLError, match="unknown backend 'torch'; there are numpy, onnx, jax"):
         load_bundle(original, "torch")
+
+
+def test_a_backend_that_is_not_installed(original: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "delayrl.deploy.backends.jax_policy", raising=False)
+    monkeypatch.setitem(sys.modules, "jax", None)  # Python's way to say that a module is not there
+    with pytest.raises(DelayRLError, match=r"this needs jax: pip install 'delayrl\[train\]'"):
+        load_bundle(original, "jax")
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_an_action_is_in_its_range(original: Path, sign: int) -> None:
+    """A plant may refuse a command that is beyond its range by a rounding."""
+    policy = load_bundle(original)
+    end = policy.high if sign > 0 else policy.low
+    beyond = np.nextafter(end, np.float32(sign * np.inf))
+    rounded = Bundle(policy.network, policy.metadata, lambda *_: beyond, "numpy")
+    np.testing.assert_array_equal(rounded(np.zeros(10), np.zeros((4, 2)), 0), end)
 
 
 @pytest.mark.parametrize(

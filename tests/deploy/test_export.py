@@ -52,7 +52,7 @@ def test_a_run_becomes_a_bundle(run: Path, tmp_path: Path, capsys: pytest.Captur
     assert metadata["action"] == {"shape": [2], "dtype": "float32", "low": [-1.0, -1.0], "high": [1.0, 1.0]}
     assert metadata["observation"]["low"] == [None] * 10
     assert metadata["step"] == 240
-    evaluation = {"step": 240, "episodes": 2, "mean_return": 240.5, "std_return": 0.5, "protocol": "corrected"}
+    evaluation = {"step": 240, "episodes": 2, "mean_return": 240.5, "std_return": 0.5**0.5, "protocol": "corrected"}
     assert metadata["evaluation"] == evaluation
     assert metadata["hyperparameters"]["width"] == 8
     assert metadata["trained_with"] == {"numpy": "2"}

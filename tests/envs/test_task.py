@@ -218,7 +218,10 @@ def test_an_instance_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     ("text", "words"),
     [
         ("Nowhere-v3", "unknown task 'Nowhere-v3'"),
-        ("my_arm", "`delayrl tasks` lists tasks to choose from, and one of your own is MODULE:NAME$"),
+        (
+            "my_arm",
+            "`delayrl tasks` lists tasks; one of your own is MODULE:NAME, or MODULE:ID if the module registers it$",
+        ),
         ("my_arm:Broken(how=1)", "cannot be made here: ValueError: the serial port is closed$"),
         ('my_arm:Broken(how="id")', r"'my_arm:Broken\(how=\"id\"\)' cannot be made here: NameNotFound: .*Nowhere"),
         ("my_arm:Broken", "cannot be made here: TypeError: .*missing 1 required positional argument: 'how'"),

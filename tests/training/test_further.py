@@ -15,9 +15,8 @@ import delayrl
 import own_tasks
 from conftest import quick
 from delayrl.cli.main import main
-from delayrl.errors import StoppedError
 from delayrl.play.run import Run
-from delayrl.training.resume import fitting, parts_of
+from delayrl.training.origin import fitting, parts_of
 from short_runs import arrays, newest, train
 
 module = import_module("delayrl.training.train")  # `delayrl.training` may show its function under that name
@@ -39,6 +38,7 @@ def test_a_run_that_goes_on_is_the_longer_run(agent: str, tmp_path: Path) -> Non
     for name, array in arrays(run).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
     assert run.config["origin"] == {"lengths": [200, 300]}
+    assert run.config["cost"] == whole.config["cost"]
     assert {row["configuration"] for row in run.rows()} == {run.config["configuration"]}
     assert len({run.config["configuration"], whole.config["configuration"], short}) == 3  # a result of its own
     assert delayrl.go_on(run.path, 400, progress=False).rows() == run.rows()  # nothing is left to do
@@ -158,7 +158,7 @@ def test_a_signal_before_the_first_step(tmp_path: Path, monkeypatch: pytest.Monk
         return begin(*given)
 
     monkeypatch.setattr(module, "start", signalled)
-    with pytest.raises(StoppedError, match="stopped at step 0"):
+    with pytest.raises(delayrl.StoppedError, match="stopped at step 0"):
         train("random", tmp_path / "run", steps=200)
     monkeypatch.undo()
     assert train("random", tmp_path / "run", steps=200).rows()
@@ -179,6 +179,9 @@ def test_a_run_from_another_goes_on_although_that_one_was_trained_further(tmp_pa
     origin = new.config["origin"]
     delayrl.go_on(old, 300, progress=False)
     assert train("bpql", tmp_path / "new", steps=200, start_from=old).config["origin"] == origin
+    other = train("bpql", tmp_path / "other", steps=200, hidden=(16,))
+    with pytest.raises(delayrl.DelayRLError, match="holds a run that began otherwise"):
+        train("bpql", tmp_path / "new", steps=200, start_from=other)
     again = train("bpql", tmp_path / "new", steps=200, start_from=old, overwrite=True)
     assert again.config["origin"]["from"]["step"] == 300
 
@@ -225,6 +228,8 @@ def test_normalised_networks_come_with_their_moments(tmp_path: Path, capsys: pyt
     assert all(f"agent.reference.{name}" in said.split("new:")[0] for name in ("actor", "critic", "target"))
     with pytest.raises(delayrl.DelayRLError, match="sac has no network that fits: it lacks"):
         train("dcac", tmp_path / "dcac", start_from=old, observation_norm="running")
+    with pytest.raises(delayrl.DelayRLError, match="its observation_norm is running, and that of the new run none"):
+        train("sac", tmp_path / "plain", start_from=old)
 
 
 def test_a_block_that_was_cut_does_not_go_on(tmp_path: Path) -> None:

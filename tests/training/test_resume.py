@@ -19,6 +19,7 @@ from delayrl.core.precision import FEW
 from delayrl.play.run import Run
 from delayrl.run.folder import RunFolder
 from delayrl.training.actor import Actor
+from delayrl.training.signals import stop_signal
 from short_runs import arrays, newest, train
 
 KILLED = ("sac", "bpql", "vdpo")
@@ -179,6 +180,22 @@ def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_pat
     assert resumed.rows() == whole.rows()
     for name, array in arrays(resumed).items():
         np.testing.assert_array_equal(array, arrays(whole)[name])
+
+
+def test_a_second_interrupt_does_not_wait_for_the_loop() -> None:
+    """While something compiles, nobody looks at the event. SIGTERM comes from machines, and may come twice."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
+    try:
+        with stop_signal() as stop:
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
+            assert stop.is_set()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_broken_checkpoint_falls_back(tmp_path: Path, monkeypatch) -> None:

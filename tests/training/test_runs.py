@@ -50,6 +50,10 @@ def test_what_is_no_run(vdpo: Run, tmp_path: Path) -> None:
         with pytest.raises(delayrl.DelayRLError) as error:
             use(tmp_path)
         assert str(error.value).endswith(f"config.json; its runs are {tmp_path / 'seed3'}, {tmp_path / 'seed10'}")
+        with pytest.raises(delayrl.DelayRLError, match=r"`delayrl runs .*` lists the runs below it$"):
+            use(tmp_path.parent)
+        with pytest.raises(delayrl.DelayRLError, match="it is a bundle, for `load_bundle`"):
+            use(Path(__file__).parents[1] / "data" / "bundle-0.1")
     for use in (delayrl.Run, delayrl.load, delayrl.evaluate):
         for thing, got in (([vdpo, vdpo], "this is a list of runs"), (3, "got 3"), (None, "got None")):
             with pytest.raises(delayrl.DelayRLError, match=f"^give one run, or the path of its folder; {got}$"):

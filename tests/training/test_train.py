@@ -261,6 +261,7 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"widht": 3}, "did you mean width"),
         ({"normalise": True}, "unknown hyperparameter 'normalise'; did you mean observation_norm"),
         ({"from_": "run"}, "unknown hyperparameter 'from_'; did you mean start_from"),
+        ({"quiet": True}, "unknown hyperparameter 'quiet'; did you mean progress"),
         ({"lr": 3}, "unknown hyperparameter 'lr'; did you mean learning_rate, actor_learning_rate, critic_"),
         ({"xyz": 3}, "unknown hyperparameter 'xyz'; `delayrl train AGENT --help` lists them"),
         ({"batch_size": 0}, "at least 1"),

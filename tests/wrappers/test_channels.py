@@ -374,6 +374,28 @@ def test_an_environment_that_resets_itself_is_refused() -> None:
     assert seen == [(0, 1), (0, 2), (0, 3), (1, 3), (2, 3), (0, 0), (0, 1), (0, 2)]
 
 
+@pytest.mark.parametrize(
+    ("method", "given", "line"),
+    [
+        ("reset", np.zeros(2), "reset of Journal must give the observation and its info .* it gave one ndarray$"),
+        ("step", (np.zeros(1), 0.0, False, {}), "step of Journal must give observation, reward, .* it gave 4 things$"),
+    ],
+)
+def test_the_api_before_gymnasium_is_named(method: str, given: object, line: str) -> None:
+    """An observation of two numbers would pass for an observation and an info."""
+    task = Journal(5)
+    env = Delayed(task, 1)
+    env.reset(seed=0)
+    setattr(task, method, lambda *_, **__: given)
+    with pytest.raises(delayrl.DelayRLError, match=line):
+        env.reset(seed=0) if method == "reset" else env.step(np.float32([0]))
+
+
+def test_a_task_that_is_delayed_already_is_not_delayed_in_silence() -> None:
+    with pytest.warns(delayrl.DelayWarning, match="DelayObservation inside Journal shows old observations already"):
+        Delayed(DelayObservation(Journal(5), 1), 1)
+
+
 def test_the_info_of_the_last_step_is_not_repeated() -> None:
     """The task's own `info` of the last step comes once, although the termination is still on its way."""
     env = Delayed(gym.wrappers.RecordEpisodeStatistics(Journal(5)), "1+reward=4")

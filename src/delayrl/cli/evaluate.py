@@ -38,6 +38,7 @@ def run(given: argparse.Namespace) -> None:
     returns = f"return {result['mean_return']:.1f} ± {result['std_return']:.1f} over {result['episodes']} episodes"
     lowest = f"the lowest {min(result['returns']):.1f}"
     print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}, {lowest}")
+    _say_unfinished(given.run, result["step"])
 
 
 def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
@@ -45,11 +46,11 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
 
     from delayrl.play.evaluation import sweep
     from delayrl.play.plots import against_delay
-    from delayrl.play.policy import load
+    from delayrl.play.policy import trained_delay
 
     if given.delay is not None:
         raise DelayRLError("--sweep plays every delay; leave --delay out")
-    delays = load(given.run, **stored).spec.delay + 1
+    delays = trained_delay(given.run).maximum + 1
     played = sweep(given.run, given.episodes, given.seed, **stored)
     results = list(tqdm(played, total=delays, unit="delay", disable=given.json))
     if given.json:
@@ -60,6 +61,15 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
             values = (r["mean_return"], r["std_return"], min(r["returns"]))
             rows.append([r["delay"], *(f"{value:.1f}" for value in values), r["episodes"]])
         print_table(["delay", "mean return", "std", "lowest", "episodes"], rows)
+    _say_unfinished(given.run, results[0]["step"])
     figure = given.run / "delays.png"
     against_delay(results, figure)
     print(f"figure: {figure}", file=sys.stderr)
+
+
+def _say_unfinished(run: Path, step: int) -> None:
+    from delayrl.run.folder import RunFolder
+
+    steps = RunFolder(run).config["schedule"]["steps"]
+    if step < steps:
+        print(f"delayrl: {run} is not finished: this is its policy after {step:,} of {steps:,} steps", file=sys.stderr)

@@ -8,6 +8,7 @@ from typing import Any
 from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
 from delayrl.play.run import Run, runs
+from delayrl.run.checkpoint import checkpoint_folders
 
 NAMES = ("agent", "preset", "env", "delay", "seed")
 
@@ -37,8 +38,9 @@ def _row(run: Run) -> dict[str, Any]:
         config, curve = run.config, run.curve()
     except DelayRLError as error:
         return row | {"error": str(error)}
-    step = int(curve.steps[-1]) if len(curve.steps) else 0
-    last = float(curve.returns[-1].mean()) if step else None
+    evaluated = max(curve.steps, default=0)
+    step = max([int(evaluated), *(int(folder.name) for folder in checkpoint_folders(run.path))])
+    last = float(curve.returns[-1].mean()) if evaluated else None
     columns = {name: config.get(name) for name in NAMES}
     return row | columns | {"step": step, "steps": config["schedule"].get("steps", 0), "return": last}
 

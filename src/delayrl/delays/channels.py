@@ -238,6 +238,8 @@ class DelayParser:
     def channels(self) -> dict[str, Channel]:
         """Return each channel that the text names."""
         channels: dict[str, Channel] = {}
+        if unknown := {*re.findall(r"\+\s*([a-z_]+)\s*=", self._text.partition("(")[0])} - {*CHANNELS}:
+            raise DelayRLError(f"{self._text!r} delays {', '.join(unknown)}; it may delay {', '.join(CHANNELS)}")
         for part in re.split(rf"\+(?=\s*(?:{'|'.join(CHANNELS)})\s*=)", self._text):
             name, separator, rest = part.partition("=")
             name = name.strip()
@@ -311,8 +313,7 @@ class DelayParser:
         """Split what follows the name of a law at its colons, and read each value with its reader."""
         words = rest.split(":")
         if len(words) != len(readers):
-            count = f"{len(readers)} values separated by colons"
-            raise DelayRLError(f"the law in {self._text!r} takes {count}; got {rest!r} ({FORMS})")
+            raise DelayRLError(f"{self._text!r} takes {len(readers)} values between colons; got {rest!r} ({FORMS})")
         return [reader(word) for reader, word in zip(readers, words, strict=True)]
 
     def real(self, word: str) -> float:

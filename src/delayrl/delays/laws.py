@@ -248,6 +248,8 @@ def random_walk(maximum: int, move: float = 2 / 3) -> Markov:
     """Make a walk on 0..maximum that moves up or down, each with probability `move` / 2. It does not leave the ends."""
     size = whole_steps(maximum) + 1
     _check_states(size)
+    if not 0 <= move <= 1:
+        raise DelayRLError(f"a walk, as in walk:MAX:MOVE, moves with a probability from 0 to 1; got {move:g}")
     chain = np.eye(size) * (1 - move)
     for state in range(size):
         chain[state, max(state - 1, 0)] += move / 2

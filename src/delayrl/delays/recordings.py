@@ -78,7 +78,7 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     if not unit:
         return number
     if not step_seconds:
-        raise DelayRLError("the task does not say how long a step is (no `dt`): give steps, or pass step_seconds")
+        raise DelayRLError("the task does not say how long a step is (no `dt`): give steps, or in Python step_seconds")
     return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds
 
 

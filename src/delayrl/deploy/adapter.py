@@ -79,6 +79,9 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         DelayRLError: no `Delayed` in it, a wrapper outside of it that may change observations or actions, or a random
             delay of the actions.
     """
+    if not callable(function):
+        line = "adapt takes a function of what the environment shows, and the environment"
+        raise DelayRLError(f"{line}; got {type(function).__name__}")
     delayed, augmented = _layers_of(env)
     history, delay = delayed.history, delayed.delay
 

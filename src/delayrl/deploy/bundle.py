@@ -11,7 +11,7 @@ from delayrl.deploy.backends.network import Act, Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import WEIGHTS, check_files, read_files
 from delayrl.deploy.runtime.episode import LONGEST_STEP, SHORTEST_STEP
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, needs_extra
 
 BACKENDS = ("numpy", "onnx", "jax")
 
@@ -79,7 +79,7 @@ class Bundle:
             action = self._act(obs, actions, age)
         if not np.isfinite(action).all():
             raise DelayRLError("the policy was given numbers so large that its action is not finite")
-        return action
+        return np.minimum(np.maximum(action, self.low), self.high)  # rounding may have brought it beyond
 
 
 def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
@@ -98,7 +98,10 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
     metadata, files = read_files(path, (WEIGHTS,))
     network, arrays = check_files(path, metadata, files)
     if backend == "jax":
-        from delayrl.deploy.backends.jax_policy import jax_policy as policy
+        try:
+            from delayrl.deploy.backends.jax_policy import jax_policy as policy
+        except ModuleNotFoundError as error:
+            raise (needs_extra(error) or error) from error
     elif backend == "onnx":
         from delayrl.deploy.backends.onnx_policy import onnx_policy as policy
     else:

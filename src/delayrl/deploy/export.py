@@ -15,6 +15,7 @@ from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import RunFolder, RunLike, path_of
 from delayrl.run.provenance import versions
+from delayrl.run.rows import deviation
 
 
 def export_run(
@@ -117,5 +118,5 @@ def _evaluation(run: RunFolder, step: int) -> dict[str, Any] | None:
         return None
     last = max(row["step"] for row in rows)
     returns = [row["return"] for row in rows if row["step"] == last]
-    moments = {"mean_return": float(np.mean(returns)), "std_return": float(np.std(returns))}
+    moments = {"mean_return": float(np.mean(returns)), "std_return": deviation(returns)}
     return {"step": last, "episodes": len(returns), **moments, "protocol": run.config.get("protocol")}

@@ -25,7 +25,7 @@ def find_id(name: str) -> str:
     if name in gym.registry:
         return name
     near = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
-    usual = "`delayrl tasks` lists tasks to choose from, and one of your own is MODULE:NAME"
+    usual = "`delayrl tasks` lists tasks; one of your own is MODULE:NAME, or MODULE:ID if the module registers it"
     hint = f"did you mean {', '.join(near)}?" if near else usual
     raise DelayRLError(f"unknown task {name!r}; {hint}")
 

@@ -1,5 +1,6 @@
 """Evaluation: deterministic actions, a start state for each episode, one row for each episode and never a mean."""
 
+import contextlib
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,6 +23,7 @@ from delayrl.play import stepping
 from delayrl.play.policy import Policy, load, spec_of, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import RunFolder, RunLike, path_of
+from delayrl.run.rows import deviation
 
 
 class Episodes(NamedTuple):
@@ -98,6 +100,10 @@ class Evaluator:
                 seen[i][j] = self._see(obs, info)
         return Episodes(returns, lengths)
 
+    def close(self) -> None:
+        """Close the environments."""
+        stepping.close(*itertools.chain(*self._envs))
+
     def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
         return stepping.step(self._envs[at[0]][at[1]], action)
 
@@ -121,7 +127,7 @@ def check_fits(env: Any, spec: Spec) -> None:
         raise DelayRLError(f"{line}; {name_of(env)} has sizes {own.obs_size} and {own.action_size}")
 
 
-@functools.cache
+@functools.lru_cache(8)
 def _compiled_act(agent: Agent) -> Any:
     """Deterministic actions for [seeds, episodes], each with a key of its own."""
 
@@ -174,7 +180,8 @@ def evaluate(
         agent: as `load`.
 
     Returns:
-        agent, env, delay, episodes, mean_return, std_return, returns.
+        agent, env, delay, step (of the training; None for a policy that does not say it), episodes, mean_return,
+        std_return (n - 1 in its denominator), returns.
 
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
@@ -211,17 +218,20 @@ def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int
         raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
     check_seed(seed)
     parsed = delay_of(task, delay)
-    evaluator = Evaluator(policy.agent, policy.spec, task, parsed, 1, episodes)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
-    with jax.default_matmul_precision("float32"):  # a GPU's own is coarser
+    with (
+        contextlib.closing(Evaluator(policy.agent, policy.spec, task, parsed, 1, episodes)) as evaluator,
+        jax.default_matmul_precision("float32"),  # a GPU's own is coarser
+    ):
         returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
     return {
         "agent": name,
         "env": str(task),
         "delay": parsed.label(),
+        "step": policy.step,
         "episodes": int(episodes),
         "mean_return": float(returns.mean()),
-        "std_return": float(returns.std()),
+        "std_return": deviation(returns),
         "returns": returns.tolist(),
     }

@@ -30,10 +30,20 @@ class Policy:
         state: its weights, a tree of arrays.
         spec: sizes of the task, and the longest age it was trained for.
         low, high: the range of its actions, [A].
+        step: how many environment steps it has learned from; None if unknown.
     """
 
-    def __init__(self, agent: Agent, state: State, spec: Spec, low: NDArray[Any], high: NDArray[Any], seed: int = 0):
-        self.agent, self.state, self.spec = agent, state, spec
+    def __init__(
+        self,
+        agent: Agent,
+        state: State,
+        spec: Spec,
+        low: NDArray[Any],
+        high: NDArray[Any],
+        seed: int = 0,
+        step: int | None = None,
+    ) -> None:
+        self.agent, self.state, self.spec, self.step = agent, state, spec, step
         self.low, self.high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         self._key = jax.random.key(seed)
         self._act = jax.jit(lambda state, seen, key: agent.act(state, seen, key, explore=False))
@@ -68,7 +78,7 @@ class Policy:
         seen = seen_now(obs, {"age": age, "actions": scaled}, self.spec.delay, privileged=False)
         self._key, key = jax.random.split(self._key)
         action = np.asarray(self._act(self.state, seen, key))
-        return self.low + (action + 1) / 2 * (self.high - self.low)
+        return np.clip(self.low + (action + 1) / 2 * (self.high - self.low), self.low, self.high)  # it is rounded
 
 
 def load(
@@ -115,9 +125,16 @@ def restored(
     agent = agent_of(config, run.path, given)
     env = make(task, trained_delay(run.path))
     spec = spec_of(env)
-    state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
     env.close()
-    return Policy(agent, state, spec, env.action_space.low, env.action_space.high)  # type: ignore[attr-defined]
+    try:
+        state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
+    except DelayRLError as error:
+        instead = [name for name, other in (("env", str(task) != config["env"]), ("agent", given is not None)) if other]
+        if not instead:
+            raise
+        raise DelayRLError(f"the run does not fit the {' and the '.join(instead)} given: {error}") from error
+    actions: Any = env.action_space
+    return Policy(agent, state, spec, actions.low, actions.high, step=checkpoint.step)
 
 
 def spec_of(env: Any) -> Spec:

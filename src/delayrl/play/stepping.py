@@ -1,5 +1,6 @@
 """Reset and step environments whose code is the user's: what it raises becomes one line that says where."""
 
+import contextlib
 import traceback
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,13 @@ def step(env: Any, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]
     except (TypeError, ValueError):
         given = f"the reward {reward!r}, terminated = {terminated!r} and truncated = {truncated!r}"
         raise DelayRLError(f"{name_of(env)} gave {given}: they must be a number and two truth values") from None
+
+
+def close(*envs: Any) -> None:
+    """Close environments. What they raise changes no result, and is left aside."""
+    for env in envs:
+        with contextlib.suppress(Exception):
+            env.close()
 
 
 def _check_shape(env: Any, truth: Any) -> None:

@@ -99,7 +99,7 @@ def check_names(values: Iterable[str], *configs: Any) -> None:
     known = [option.name for config in configs for option in options(config)]
     for name in values:
         if name not in known:
-            near = near_names(name, [*known, "start_from"])  # an option of `train` alone
+            near = near_names(name, [*known, "start_from", "progress"])  # options of `train` alone
             hint = f"did you mean {', '.join(near)}?" if near else "`delayrl train AGENT --help` lists them"
             raise DelayRLError(f"unknown hyperparameter {name!r}; {hint}")
 

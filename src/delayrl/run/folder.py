@@ -75,10 +75,14 @@ class RunFolder:
         return config  # type: ignore[no-any-return]
 
     def check_exists(self) -> None:
-        """Raise DelayRLError if no run has begun here. The message names the runs of several seeds."""
+        """Raise DelayRLError if no run has begun here. The message says what it is instead."""
         if not self.exists:
             below = ", ".join(map(str, _below(self.path)))
             hint = f"; its runs are {below}" if below else ""
+            if (self.path / "bundle.json").exists():
+                hint = "; it is a bundle, for `load_bundle` or `delayrl latency`"
+            elif not below and self.path.is_dir():
+                hint = f"; `delayrl runs {self.path}` lists the runs below it"
             raise DelayRLError(f"{self.path} is not a run folder: it has no config.json{hint}")
 
     def create(self, config: Mapping[str, Any]) -> None:

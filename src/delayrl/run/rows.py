@@ -4,6 +4,9 @@ import math
 from collections.abc import Mapping, Sequence, Sized
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from delayrl.errors import DelayRLError
 
 Row = dict[str, Any]
@@ -27,6 +30,11 @@ def whole_evaluations(episodes: Mapping[int, Sized]) -> list[int]:
     """Return the steps of a policy's evaluations, in order, but not of one that a crash cut: it has fewer episodes."""
     most = max(map(len, episodes.values()), default=0)
     return sorted(step for step, played in episodes.items() if len(played) == most)
+
+
+def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float:
+    """Return the standard deviation of episodes' returns, with n - 1 in the denominator; 0 for one episode."""
+    return float(np.std(returns, ddof=1)) if np.size(returns) > 1 else 0.0
 
 
 def name_configuration(rows: Sequence[Row]) -> list[Row]:

@@ -55,6 +55,7 @@ def go_on(
 
     Raises:
         DelayRLError: no run, fewer steps than it has, a run whose replay is gone, and what `train` raises.
+        StoppedError: as `train`.
     """
     runs = seed_folders(run)
     configs = [one.config for one in runs]

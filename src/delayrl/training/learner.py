@@ -152,4 +152,4 @@ class Program:
         return Learner(agent, replay), metrics
 
 
-compiled = functools.cache(Program)
+compiled = functools.lru_cache(8)(Program)  # of about 70 MB each

@@ -7,6 +7,7 @@ chosen before the update that follows a step: the device learns while the enviro
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import jax
@@ -41,14 +42,13 @@ def run(group: Group, state: TrainState, note: Callable[[str], None], stopped: C
     """
     steps, ways = group.setup.schedule.steps, group.ways
     if state.step < steps:
-        loop = Loop(group, state, Recorder(group, state.learner.agent, state.actors[0].env, ways.track))
+        recorder = Recorder(group, state.learner.agent, state.actors[0].env, ways.track)
         if ways.progress:
             note(f"estimate: {estimate(group, state)}")
         interval = 0.5 if sys.stderr.isatty() else 30
         options = {"disable": not ways.progress, "smoothing": 0.05, "dynamic_ncols": True, "mininterval": interval}
-        bar = tqdm(total=steps, initial=state.step, unit="step", **options)
-        with bar:
-            loop.train(stopped, bar)
+        with tqdm(total=steps, initial=state.step, unit="step", **options) as bar, closing(recorder):
+            Loop(group, state, recorder).train(stopped, bar)
     for folder in group.folders:
         curve(folder.read("rows"), folder.path / "curve.png")
 
@@ -88,8 +88,7 @@ class Loop:
 
     def step(self) -> None:
         """Act once in every environment, and learn from the steps before if a block of them is full."""
-        state = self.state
-        actions = self.choose()
+        state, actions = self.state, self.choose()
         if len(state.pending) == self.group.setup.schedule.updates_per_call:
             self.learn()
         actions, state.actions = np.asarray(actions), None
@@ -123,8 +122,9 @@ class Loop:
         if due and not self._learning:
             self._learning = True
             if not self._can_learn():  # the first block's own steps count too
-                task = group.setup.condition.env
-                raise DelayRLError(f"no episode of {task} is long enough to learn from under this protocol")
+                raise DelayRLError(
+                    f"no episode of {group.setup.condition.env} is long enough to learn from under this protocol"
+                )
 
     def _act(self) -> Any:
         group, state = self.group, self.state

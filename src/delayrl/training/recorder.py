@@ -75,6 +75,11 @@ class Recorder:
                 tracker.write(step, {f"return/{policy}": float(played.returns[i].mean())})
         return " · ".join(summary)
 
+    def close(self) -> None:
+        """Close the environments of the evaluations."""
+        for evaluator in self._evaluators.values():
+            evaluator.close()
+
     def episodes(self, ended: list[list[dict[str, Any]]]) -> None:
         """Write a row for each episode of training that ended, [seeds][episodes], and empty the lists."""
         for run, own in zip(self._group.folders, ended, strict=True):

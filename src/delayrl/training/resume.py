@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from delayrl.agents.base import Schedule, State
+from delayrl.agents.base import Schedule
 from delayrl.core import replay as ring
 from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
@@ -22,14 +22,13 @@ from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
 from delayrl.training.cost import cost_of
 from delayrl.training.learner import Learner, Stored
+from delayrl.training.origin import taken_over
 from delayrl.training.state import Group, TrainState
 
 COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
 """The columns of a replay that have one entry for each row."""
 COUNTS = ("rows", "steps", "lost")
 KEPT = "the last good checkpoint is kept"
-RENAMED = (("", "reference."), ("", "delayed."), ("reference.", ""), ("delayed.", ""), ("", ""))
-"""Beginnings of names in another run, and here: agents inside agents. Where two fit as well, the later one counts."""
 
 
 def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
@@ -49,12 +48,14 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     state = restore(group, actors, checkpoints) if checkpoints else _fresh(group, actors, note)
     for run in replaced:  # now that nothing can be refused any more
         run.remove()
-    config |= {"configuration": group.setup.configuration, "versions": versions()}
-    if not all(run.exists for run in runs):
+    config |= {"configuration": group.setup.configuration}
+    new = [run for run in runs if not run.exists]
+    longer = [run for run in runs if run.exists and run.config["schedule"]["steps"] != group.setup.schedule.steps]
+    if new or longer:
         config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
     for run, seed in zip(runs, group.seeds, strict=True):
-        if not run.exists:
-            run.create(config | {"seed": seed})
+        if run in new:
+            run.create(config | {"versions": versions(), "seed": seed})
     if not checkpoints:
         for run in runs:
             run.rewind(-1)
@@ -63,111 +64,25 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
     for run, checkpoint in zip(runs, checkpoints, strict=True):
-        if run.config["schedule"]["steps"] != group.setup.schedule.steps:
-            run.extend(run.config | group.setup.config | {"configuration": group.setup.configuration})
+        if run in longer:
+            run.extend(run.config | config)
         run.rewind(newest.step)
         if complete:
             run.finish(slim=group.ways.slim or not checkpoint.can_go_on)
     return state
 
 
-def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], Checkpoint]:
-    """Return what the configuration says of a run whose networks others begin with, and its newest checkpoint.
-
-    Of runs that have `begun` with it, this is what they say, although it may have been trained further since.
-    """
-    config, checkpoint = run.config, run.latest()
-    names = ("agent", "env", "delay", "seed", "configuration")
-    described = {name: config[name] for name in names if name in config}
-    described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}
-    stored = begun[0].config.get("origin", {}).get("from", {}) if begun and begun[0].checkpoints()[0] else {}
-    same = all(stored.get(name) == described.get(name) for name in ("agent", "env", "delay", "seed"))
-    return stored if same else described, checkpoint
-
-
 def _fresh(group: Group, actors: list[Actor], note: Callable[[str], None]) -> TrainState:
     """Return the state in which a run begins, with the networks of another run as far as they fit, if there is one."""
     learner = group.program.init(group.keys, group.replay_rows)
     if group.source is not None:
-        learner = learner._replace(agent=_taken_over(learner.agent, group.source, note))
+        learner = learner._replace(agent=taken_over(learner.agent, group.source, note))
     return _nothing_stored(0, learner, actors)
 
 
 def _nothing_stored(step: int, learner: Learner, actors: list[Actor]) -> TrainState:
     """Return the state at a step with no file of a replay."""
     return TrainState(step, learner, actors, [], None, [{} for _ in actors], [(0, 0) for _ in actors])
-
-
-def _taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:
-    """Return a fresh agent with the networks of another run that fit. Raises DelayRLError if none does."""
-    stored = source.arrays("agent")
-    fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
-    parts, filled = parts_of(fresh), Arrays()
-    offers = [_renamed(stored, old, new) for old, new in RENAMED]
-    for offered in sorted(offers, key=lambda offered: len(fitting(fresh, offered))):  # what fits best overwrites others
-        filled |= {name: offered[name] for part in fitting(fresh, offered) for name in parts[part]}
-    taken = [part for part, names in parts.items() if names[0] in filled]
-    left = ", ".join(part for part in parts if part not in taken)
-    if not set(taken) - {"moments"}:
-        where = source.path.parents[1]
-        raise DelayRLError(f"{where} has no network that fits: it lacks {left}, or has them in other sizes")
-    note(f"taken over: {', '.join(taken)}; new: {left or 'no network'}, and the optimisers")
-    leaves, form = jax.tree.flatten(agent)
-    pairs = zip(leaves, fresh, strict=True)
-    return jax.tree.unflatten(form, [jnp.broadcast_to(filled.get(name, leaf), leaf.shape) for leaf, name in pairs])
-
-
-def _renamed(stored: Arrays, old: str, new: str) -> Arrays:
-    """Return the arrays whose names begin with `old`, under names that begin with `new` instead."""
-    renamed: Arrays = {}
-    for name, array in stored.items():
-        outer = "agent." * name.startswith("agent.")  # where normalisation keeps the agent
-        if name.startswith(outer + old):
-            renamed[outer + new + name.removeprefix(outer + old)] = array
-    return renamed
-
-
-def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
-    """Return the parts of an agent's state that stored arrays can fill; a lone number only beside a network.
-
-    Optimisers and counters are in no part: they are never taken over.
-    """
-    parts = parts_of(fresh)
-    deeper = {part_of(name) for name in stored.keys() - fresh.keys() if any(word.isdigit() for word in name.split("."))}
-
-    def fits(name: str) -> bool:
-        return name in stored and stored[name].shape == fresh[name].shape
-
-    def agent_of(part: str) -> str:
-        return part.rpartition(".")[0]
-
-    taken = [part for part, names in parts.items() if part not in deeper and all(map(fits, names))]
-    numbers = {part for part in taken if part in fresh and fresh[part].ndim == 0}
-    begun = {agent_of(part) for part in taken if part not in numbers}
-    return [part for part in taken if part not in numbers or agent_of(part) in begun]
-
-
-def parts_of(state: Arrays) -> dict[str, list[str]]:
-    """Return what an agent has learned: the leaves of each network, and of each number such as a temperature."""
-    learned = {name: leaf for name, leaf in state.items() if is_learned(name, leaf)}
-    parts: dict[str, list[str]] = {}
-    for name in sorted(learned, key=lambda name: learned[name].ndim == 0):  # numbers last
-        part = part_of(name)
-        lone = learned[name].ndim == 0 and part not in parts
-        parts.setdefault(name if lone else part, []).append(name)
-    return parts
-
-
-def is_learned(name: str, leaf: Any) -> bool:
-    """Return whether a leaf of an agent's state is learned: it is no optimiser's, and no counter."""
-    return "opt_state" not in name and jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
-def part_of(leaf: str) -> str:
-    """Return the network that an array is in: "reference.critic" of "reference.critic.0.1.w"."""
-    names = leaf.split(".")
-    first = next((i for i, name in enumerate(names) if name.isdigit()), max(len(names) - 1, 1))
-    return ".".join(names[:first])
 
 
 def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Checkpoint]:

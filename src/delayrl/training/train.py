@@ -17,6 +17,7 @@ from delayrl.core.precision import setting
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task
+from delayrl.play import stepping
 from delayrl.play.policy import spec_of
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
@@ -29,7 +30,8 @@ from delayrl.training.checks import check_fit, check_memory, check_ways
 from delayrl.training.learner import compiled
 from delayrl.training.loop import run
 from delayrl.training.machine import shared
-from delayrl.training.resume import source_of, start
+from delayrl.training.origin import source_of
+from delayrl.training.resume import start
 from delayrl.training.seeds import run_folders, seed_numbers
 from delayrl.training.signals import stop_signal
 from delayrl.training.state import Callback, Group, Ways
@@ -95,7 +97,7 @@ def train(
         The run, or the list of runs if `seeds` is above 1 or a list.
 
     Raises:
-        DelayRLError: bad input, a damaged run, NaN from the environment, a full disk.
+        DelayRLError: bad input, a damaged run, NaN from the environment, a full disk; a StoppedError after Ctrl-C.
     """
     setup = resolve(agent, as_task(env, env_kwargs, wrappers, flatten), delay, preset, protocol, values)
     numbers = seed_numbers(seed, seeds)
@@ -123,14 +125,15 @@ def train_group(
 ) -> None:
     """Train seeds in lockstep, each in its folder, from where it stands; `given` is the delay as the user wrote it."""
     check_ways(ways)
-    envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
-    spec = spec_of(envs[0])
-    shapes = check_fit(setup, envs[0])  # before anything is stored
-    check_memory(setup, spec, len(numbers), ways.device)
-    keep_compiled()
-    if ways.device != "gpu":
-        keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
     with ExitStack() as held:
+        envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
+        held.callback(stepping.close, *envs)
+        spec = spec_of(envs[0])
+        shapes = check_fit(setup, envs[0])  # before anything is stored
+        check_memory(setup, spec, len(numbers), ways.device)
+        keep_compiled()
+        if ways.device != "gpu":
+            keep_buffers(setup.agent, spec, len(numbers))  # before JAX looks for its devices
         stop = held.enter_context(stop_signal())
         for folder in folders:
             held.enter_context(hold(folder.path))
@@ -153,6 +156,6 @@ def train_group(
         elif given is not None and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         state = start(group, actors, overwrite, note)
-        if state.step < setup.schedule.steps and (lines := shared(numbers, folders, ways.device)):
+        if state.step == 0 and (lines := shared(numbers, folders, ways.device)):
             note(lines)
         run(group, state, note, stop.is_set)

@@ -1,13 +1,14 @@
 """The wrapper that delays one environment."""
 
 import warnings
+from collections.abc import Iterator
 from typing import Any, SupportsFloat, get_args
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import Autoreset, TimeLimit
+from gymnasium.wrappers import Autoreset, DelayObservation, TimeLimit
 from numpy.typing import NDArray
 
 from delayrl.delays import Delay, DelayLike, as_delay
@@ -38,42 +39,32 @@ def name_of(env: Any) -> str:
 
 def seconds_of(env: Any) -> float | None:
     """Return the length of a step in seconds: the `dt` of the outermost layer that has one, or the task's `tau`."""
-    layers = [env]
-    while isinstance(layers[-1], gym.Wrapper):
-        layers.append(layers[-1].env)
+    layers = list(layers_of(env))
     for seconds in [*(getattr(layer, "dt", None) for layer in layers), getattr(layers[-1], "tau", None)]:
         if isinstance(seconds, int | float | np.number) and seconds > 0:
             return float(seconds)
     return None
 
 
+def layers_of(env: Any) -> Iterator[Any]:
+    """Yield an environment, and what it wraps, layer by layer."""
+    yield env
+    while isinstance(env, gym.Wrapper):
+        env = env.env
+        yield env
+
+
 def find_delayed(env: Any) -> "Delayed | None":
     """Return the `Delayed` that an environment is or wraps, if any."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, Delayed):
-            return env
-        env = env.env
-    return None
-
-
-def resets_itself(env: Any) -> bool:
-    """Return whether an environment is or wraps an `Autoreset`."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, Autoreset):
-            return True
-        env = env.env
-    return False
+    return next((layer for layer in layers_of(env) if isinstance(layer, Delayed)), None)
 
 
 def limit_of(env: Any) -> int | None:
     """Return the time limit of an environment in steps, from its spec or a `TimeLimit` around it; None without one."""
     if env.spec is not None and env.spec.max_episode_steps is not None:
         return int(env.spec.max_episode_steps)
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, TimeLimit):  # an environment that was not made by an id has no spec
-            return env._max_episode_steps
-        env = env.env
-    return None
+    limits = (layer._max_episode_steps for layer in layers_of(env) if isinstance(layer, TimeLimit))
+    return next(limits, None)  # of an environment that was not made by an id, and has no spec
 
 
 def check_limit(env: Any, name: str) -> None:
@@ -90,6 +81,26 @@ def check_length(delay: Delay, name: str, limit: int | None) -> None:
         raise DelayRLError(f"a delay of {longest} steps is longer than an episode of {name} ({limit} steps)")
 
 
+def warn_once(line: str) -> None:
+    """Warn of the task that a user makes. Training makes the same task many times."""
+    if line not in _warned:
+        _warned.add(line)
+        warnings.warn(line, DelayWarning, stacklevel=4)
+
+
+def check_layers(env: Any) -> None:
+    """Raise DelayRLError if an environment is delayed, or resets itself; warn if another library delays it."""
+    layers = list(layers_of(env))
+    if find_delayed(env):
+        raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
+    if any(isinstance(layer, Autoreset) for layer in layers):
+        line = "Autoreset inside Delayed would carry what is on its way into the next episode"
+        raise DelayRLError(f"{line}: put it outside, Autoreset(Delayed(task, delay))")
+    if any(isinstance(layer, DelayObservation) for layer in layers):
+        line = "shows old observations already, and no age counts that: give the delay to Delayed (--delay) alone"
+        warn_once(f"the DelayObservation inside {name_of(env)} {line}")
+
+
 def history_rows(env: Any, delay: Delay, history: int | None) -> int:
     """Return the rows of the action history; None asks for the longest age. Raises DelayRLError if they are too few."""
     name, limit = name_of(env), limit_of(env)
@@ -98,9 +109,7 @@ def history_rows(env: Any, delay: Delay, history: int | None) -> int:
     if limit is not None and delay.observation.constant and late >= limit - 1:
         line = f"with a delay of {late} steps nothing after the start of an episode of {name} "
         line += f"({limit} steps) is ever observed: the agent acts on s_0 and its own actions alone"
-        if line not in _warned:
-            _warned.add(line)
-            warnings.warn(line, DelayWarning, stacklevel=3)
+        warn_once(line)
     if history is None:
         return delay.maximum
     if whole_steps(history) < delay.maximum:
@@ -116,6 +125,15 @@ def make_transit(delay: Delay, history: int, fill: Fill, actions: Box, idle: Any
     if idle.shape != actions.shape or not np.isfinite(idle).all():
         raise DelayRLError(f"the idle action must be finite and have the shape {actions.shape}; got {idle}")
     return Transit(delay, history, fill, np.clip(idle.astype(actions.dtype), actions.low, actions.high))
+
+
+def _parts(env: Any, method: str, given: Any, count: int, names: str) -> tuple[Any, ...]:
+    """Return what an environment gives, if it is a tuple of so many parts. Raises DelayRLError, with their names."""
+    several = isinstance(given, tuple | list)
+    if several and len(given) == count:
+        return tuple(given)
+    got = f"{len(given)} things" if several else f"one {type(given).__name__}"
+    raise DelayRLError(f"{method} of {name_of(env)} must give {names} (the API of Gymnasium); it gave {got}")
 
 
 class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):
@@ -160,11 +178,7 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
-        if find_delayed(env):
-            raise DelayRLError("the environment is delayed already: give one delay, e.g. '2+action=1'")
-        if resets_itself(env):
-            line = "Autoreset inside Delayed would carry what is on its way into the next episode"
-            raise DelayRLError(f"{line}: put it outside, Autoreset(Delayed(task, delay))")
+        check_layers(env)
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
         self.step_seconds = seconds_of(env) if step_seconds is None else step_seconds
@@ -184,7 +198,8 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[Any], Info]:
         """Start an episode. The seed fixes its delays too."""
-        self._truth, self._info = self.env.reset(seed=seed, options=options)
+        shown = self.env.reset(seed=seed, options=options)
+        self._truth, self._info = _parts(self.env, "reset", shown, 2, "the observation and its info")
         self._transit.reset(self._truth, seed)
         return self._show()
 
@@ -197,7 +212,9 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
             truncated = self._limit is not None and self._transit.time + 1 >= self._limit
             self._info = {}
         else:
-            self._truth, reward, terminated, truncated, self._info = self.env.step(applied)
+            shown = self.env.step(applied)
+            parts = _parts(self.env, "step", shown, 5, "observation, reward, terminated, truncated and info")
+            self._truth, reward, terminated, truncated, self._info = parts
         reward, terminated, truncated = self._transit.step(self._truth, reward, terminated, truncated)
         obs, info = self._show()
         return obs, reward, terminated, truncated, info

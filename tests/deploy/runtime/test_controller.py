@@ -426,6 +426,19 @@ def test_bad_settings_are_refused(arguments: dict, message: str) -> None:
         Controller(counting(), **arguments)
 
 
+def test_what_is_no_policy_is_refused_at_once() -> None:
+    """Not at the first command, when the plant waits for it."""
+
+    class Wrong(Counting):
+        def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+            return np.full(2, np.nan)
+
+    with pytest.raises(DelayRLError, match=r"the policy's action must be 1 finite numbers; got \[nan, nan\]"):
+        Controller(Wrong(1, 3))
+    with pytest.raises(DelayRLError, match=r"a policy also says its obs_size, action_size, low, high, max_age, dt"):
+        Controller(np.sin)
+
+
 def test_a_policy_may_overwrite_its_inputs() -> None:
     class Overwriter(Counting):
         def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
@@ -476,7 +489,7 @@ def test_a_policy_without_a_number_is_not_recorded() -> None:
 def test_time_must_go_forward() -> None:
     controller = Controller(counting(), stamps="seconds", dt=0.1)
     controller.observe([0.0], 5.0, 5.0)
-    with pytest.raises(ClockError, match="an observation of 5 is here"):
+    with pytest.raises(ClockError, match="more than half a step before the newest observation, made at 5"):
         controller.act(4.9)
     controller.act(5.0)
     for now in (5.0, 4.0, -math.inf):

@@ -78,7 +78,7 @@ class Controller:
     `observe` may be called from another thread than `act`, and does not wait for the policy.
 
     Args:
-        policy: is called once here, so that the time it takes to compile does not delay an action.
+        policy: is called once here, at age 0, so that what is wrong is found, and no action waits until it compiles.
         stamps: "steps" or "seconds", the unit of every stamp and of `now`.
         dt: seconds a step, for stamps in seconds; None for the policy's own.
         action_delay: steps from a command to its effect, κ, which is part of the age. None for the policy's own
@@ -103,6 +103,8 @@ class Controller:
         idle: ArrayLike | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        if missing := [name for name in ControlPolicy.__annotations__ if not hasattr(policy, name)]:
+            raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}")
         if on_overrun not in get_args(OnOverrun):
             raise DelayRLError(f"on_overrun is hold, clip or raise; got {on_overrun!r}")
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
@@ -117,7 +119,7 @@ class Controller:
         capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
         self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
         self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
-        policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
+        _decide(policy, np.zeros(policy.obs_size), [], 0)
 
     @property
     def serves(self) -> str:

@@ -197,7 +197,8 @@ class Episode:
         """Return `now` as a float. Raises ClockError unless it is after the last command."""
         time = self._now(now)
         if time <= self._last_command:
-            raise ClockError(f"time went backwards: now is {time:g}, the last command was at {self._last_command:g}")
+            last = f"the last command was at {self._last_command:g}"
+            raise ClockError(f"time went backwards, or stood still: now is {time:g}, and {last}")
         if self._clock.stamps == "steps" and time < 0:
             raise ClockError(f"steps count from 0; now is {time:g}")
         return time
@@ -205,9 +206,11 @@ class Episode:
     def newest(self, now: float) -> Newest:
         """Return the newest observation with its age. Raises DelayRLError if none has arrived before `now`."""
         if self.obs is None:
-            raise DelayRLError("no observation has arrived in this episode: wait until `controller.ready`")
+            hint = "wait until `controller.ready`; `statistics` counts what was refused"
+            raise DelayRLError(f"this episode has no observation: {hint}")
         if self._stamp > now + self._clock.period / 2:
-            raise ClockError(f"time went backwards: now is {now:g}, an observation of {self._stamp:g} is here")
+            newest = f"the newest observation, made at {self._stamp:g}"
+            raise ClockError(f"now is {now:g}, more than half a step before {newest}")
         elapsed = self._elapsed(now)
         step, age, actions = self.history.age(self._stamp, now, elapsed)
         warm = self._first_command is not None and step > self._first_command

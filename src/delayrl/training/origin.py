@@ -1,0 +1,110 @@
+"""Beginning with the networks of another run: which it was, and which of them fit."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from delayrl.agents.base import State
+from delayrl.errors import DelayRLError
+from delayrl.run.arrays import Arrays, flatten_tree
+from delayrl.run.checkpoint import Checkpoint
+from delayrl.run.folder import RunFolder
+
+RENAMED = (("", "reference."), ("", "delayed."), ("reference.", ""), ("delayed.", ""), ("", ""))
+"""Beginnings of names in another run, and here: agents inside agents. Where two fit as well, the later one counts."""
+
+
+def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], Checkpoint]:
+    """Return what the configuration says of a run whose networks others begin with, and its newest checkpoint.
+
+    Of runs that have `begun` with it, this is what they say, although it may have been trained further since.
+    """
+    config, checkpoint = run.config, run.latest()
+    names = ("agent", "env", "delay", "seed", "configuration")
+    described = {name: config[name] for name in names if name in config}
+    described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}
+    stored = begun[0].config.get("origin", {}).get("from", {}) if begun and begun[0].checkpoints()[0] else {}
+    same = all(stored.get(name) == described.get(name) for name in ("agent", "env", "delay", "seed"))
+    further = same and (described["step"] > stored["step"] or described["networks"] == stored["networks"])
+    return stored if further else described, checkpoint
+
+
+def taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:
+    """Return a fresh agent with the networks of another run that fit. Raises DelayRLError if none does."""
+    stored = source.arrays("agent")
+    fresh = flatten_tree(jax.tree.map(lambda x: x[0], agent))
+    parts, filled = parts_of(fresh), Arrays()
+    offers = [_renamed(stored, old, new) for old, new in RENAMED]
+    for offered in sorted(offers, key=lambda offered: len(fitting(fresh, offered))):  # what fits best overwrites others
+        filled |= {name: offered[name] for part in fitting(fresh, offered) for name in parts[part]}
+    taken = [part for part, names in parts.items() if names[0] in filled]
+    left = ", ".join(part for part in parts if part not in taken)
+    if not set(taken) - {"moments"}:
+        where, norms = source.path.parents[1], [_normalisation(arrays) for arrays in (stored, fresh)]
+        line = f"{where} has no network that fits: it lacks {left}, or has them in other sizes"
+        hint = "; its observation_norm is {}, and that of the new run {}".format(*norms) if len(set(norms)) > 1 else ""
+        raise DelayRLError(line + hint)
+    note(f"taken over: {', '.join(taken)}; new: {left or 'no network'}, and the optimisers")
+    leaves, form = jax.tree.flatten(agent)
+    pairs = zip(leaves, fresh, strict=True)
+    return jax.tree.unflatten(form, [jnp.broadcast_to(filled.get(name, leaf), leaf.shape) for leaf, name in pairs])
+
+
+def _normalisation(state: Arrays) -> str:
+    """Return the observation_norm of an agent with this state."""
+    return "running" if any(name.startswith("agent.") for name in state) else "none"
+
+
+def _renamed(stored: Arrays, old: str, new: str) -> Arrays:
+    """Return the arrays whose names begin with `old`, under names that begin with `new` instead."""
+    renamed: Arrays = {}
+    for name, array in stored.items():
+        outer = "agent." * name.startswith("agent.")  # where normalisation keeps the agent
+        if name.startswith(outer + old):
+            renamed[outer + new + name.removeprefix(outer + old)] = array
+    return renamed
+
+
+def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
+    """Return the parts of an agent's state that stored arrays can fill; a lone number only beside a network.
+
+    Optimisers and counters are in no part: they are never taken over.
+    """
+    parts = parts_of(fresh)
+    deeper = {part_of(name) for name in stored.keys() - fresh.keys() if any(word.isdigit() for word in name.split("."))}
+
+    def fits(name: str) -> bool:
+        return name in stored and stored[name].shape == fresh[name].shape
+
+    def agent_of(part: str) -> str:
+        return part.rpartition(".")[0]
+
+    taken = [part for part, names in parts.items() if part not in deeper and all(map(fits, names))]
+    numbers = {part for part in taken if part in fresh and fresh[part].ndim == 0}
+    begun = {agent_of(part) for part in taken if part not in numbers}
+    return [part for part in taken if part not in numbers or agent_of(part) in begun]
+
+
+def parts_of(state: Arrays) -> dict[str, list[str]]:
+    """Return what an agent has learned: the leaves of each network, and of each number such as a temperature."""
+    learned = {name: leaf for name, leaf in state.items() if is_learned(name, leaf)}
+    parts: dict[str, list[str]] = {}
+    for name in sorted(learned, key=lambda name: learned[name].ndim == 0):  # numbers last
+        part = part_of(name)
+        lone = learned[name].ndim == 0 and part not in parts
+        parts.setdefault(name if lone else part, []).append(name)
+    return parts
+
+
+def is_learned(name: str, leaf: Any) -> bool:
+    """Return whether a leaf of an agent's state is learned: it is no optimiser's, and no counter."""
+    return "opt_state" not in name and jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def part_of(leaf: str) -> str:
+    """Return the network that an array is in: "reference.critic" of "reference.critic.0.1.w"."""
+    names = leaf.split(".")
+    first = next((i for i, name in enumerate(names) if name.isdigit()), max(len(names) - 1, 1))
+    return ".".join(names[:first])
