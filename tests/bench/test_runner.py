@@ -19,7 +19,7 @@ from delayrl.bench.grid import load_grid
 from delayrl.bench.runner import Completion, run_cells
 from delayrl.bench.status import line, seconds_left, standing
 from delayrl.bench.worker import Outcome
-from delayrl.cli.bench import idle, seconds
+from delayrl.cli.bench import idle, time_limit
 from delayrl.cli.main import main
 from delayrl.run.cell import Cell, Progress
 from delayrl.run.condition import Condition
@@ -367,10 +367,10 @@ def test_a_small_grid_is_told_how_to_use_all_workers() -> None:
 
 @pytest.mark.parametrize(("text", "value"), [("90s", 90), ("9m", 540), ("1h30m", 5400), ("2d", 172800)])
 def test_times(text: str, value: int) -> None:
-    assert seconds(text) == value
+    assert time_limit(text) == value
     for bad in (text + "x", "", "9", "m", "0s"):
         with pytest.raises(delayrl.DelayRLError, match="a time is written as"):
-            seconds(bad)
+            time_limit(bad)
 
 
 @pytest.mark.parametrize("option", ["--submit", "--sbatch=--partition=gpu", "--address=auto", "--gpus=1"])

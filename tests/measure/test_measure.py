@@ -14,7 +14,7 @@ import pytest
 from gymnasium.spaces import Box
 from gymnasium.wrappers import DelayObservation, StickyAction
 
-from delayrl import DelayRLError
+from delayrl import DelayRLError, DelayWarning
 from delayrl.cli.console import seconds
 from delayrl.cli.main import main
 from delayrl.delays import as_delay
@@ -411,6 +411,9 @@ def test_columns_units_and_recordings(tmp_path: Path) -> None:
     )
     words = {"time": "clock", "commands": ["wish"], "observations": ["angle"]}
     e = from_log(path, episode="part", unit="ms", **words)
+    line = r"lie 20 s apart: if its time stamps are in milliseconds, say so \(--unit ms\)"
+    with pytest.warns(DelayWarning, match=line):
+        from_log(path, episode="part", **words)
     assert (e.row, e.delay) == (pytest.approx(ROW), pytest.approx(3 * ROW))
     assert (e.peak.command, e.peak.observation) == ("wish", "angle")
     with pytest.raises(DelayRLError, match="row 401: clock goes back"):

@@ -44,6 +44,8 @@ def test_by_hand(agent: str, delay: int, updates: int, monkeypatch: pytest.Monke
 def test_nothing_is_learned_before_the_first_update(monkeypatch: pytest.MonkeyPatch) -> None:
     said = words(monkeypatch, "bpql", 3, steps=300_000, random_steps=299_999)
     assert said == "about 1 min for 300,000 steps on this device"
+    few = words(monkeypatch, "bpql", 3, steps=30_000, random_steps=29_999)
+    assert few == "less than a minute for 30,000 steps on this device"
 
 
 def test_an_unknown_cost_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

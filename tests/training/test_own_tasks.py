@@ -55,6 +55,20 @@ def test_a_run_names_its_task(tmp_path: Path) -> None:
     assert evaluate(run, 2, env=text)["returns"] == result["returns"]
 
 
+class Unseeded(Arm):
+    """An arm that begins anywhere, whatever its seed."""
+
+    def reset(self, **options: Any) -> Any:
+        return super().reset(**options | {"seed": None})
+
+
+def test_a_task_that_ignores_its_seed_is_named_at_the_start(tmp_path: Path) -> None:
+    """Not hours later, when the run is stopped and cannot go on."""
+    line = "Unseeded does not begin an episode twice in the same way from one seed .* nor go on after a stop"
+    with pytest.warns(delayrl.DelayWarning, match=line):
+        train("random", tmp_path / "run", env=Unseeded, wrappers=[LIMIT])
+
+
 def test_a_function_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> None:
     """Trained, killed, resumed and evaluated with the same function, it gives what a named one gives."""
     maker = functools.partial(make_arm)

@@ -42,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--cells", nargs="+", metavar="ID", help="only these cells")
     add("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
     add("--workers", type=whole, metavar="N", help="cells at a time (default: one a core, or one with a GPU)")
-    add("--time-limit", type=seconds, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")
+    add("--time-limit", type=time_limit, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")
     add("--tries", type=whole, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)")
     add("--device", choices=["cpu", "gpu"], help="(default: JAX's choice)")
     add("--sbatch", action="append", metavar="OPTION", help="slurm: e.g. --sbatch=--partition=gpu")
@@ -225,7 +225,7 @@ def _check_at_least_one(name: str, value: int | None) -> None:
         raise DelayRLError(f"{name} must be at least 1; got {value}")
 
 
-def seconds(text: str) -> float:
+def time_limit(text: str) -> float:
     """Return the seconds of a time such as 90s, 9m, 1h30m or 2d. Raises DelayRLError for another text."""
     match = re.fullmatch(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
     days, hours, minutes, rest = (int(part or 0) for part in match.groups()) if match else (0, 0, 0, 0)

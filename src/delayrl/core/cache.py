@@ -30,7 +30,7 @@ def keep_compiled() -> Path | None:
         return None
     try:
         given = Path(os.environ.get("XDG_CACHE_HOME", ""))  # a relative one is to be ignored
-        folder = (given if given.is_absolute() else Path.home() / ".cache") / "delayrl" / processor()
+        folder = (given if given.is_absolute() else Path.home() / ".cache") / "delayrl" / processor_kind()
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
         folder = folder.resolve()
@@ -45,7 +45,7 @@ def keep_compiled() -> Path | None:
     return folder
 
 
-def processor() -> str:
+def processor_kind() -> str:
     """Return a name for this kind of processor: a program that was compiled for it may not run on another."""
     parts = [sys.platform, platform.machine(), platform.processor()]
     if (about := Path("/proc/cpuinfo")).exists():

@@ -1,5 +1,6 @@
 """Estimate the delay of a running system from its log: exactly from stamps of the observations, or by correlation."""
 
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from delayrl.delays import PerEpisode, any_phase, uniform
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.measure import ages, correlate, reading
 from delayrl.measure.ages import TOLERANCE, rounded_up_steps
 from delayrl.measure.correlate import Array
@@ -19,6 +20,7 @@ RESAMPLINGS = 200
 LEAST_ROWS = 200
 WINDOW_ROWS = 400  # least rows of a part of the log with its own estimate
 WINDOWS = 8
+SLOW = 2.0  # seconds between rows, beyond which the unit is doubtful
 WARM_UP = 0.05  # of the log, the part that is left out at its start by default
 
 
@@ -158,10 +160,15 @@ def from_log(
             raise DelayRLError(f"--{name} is a time in seconds; got {value}")
     exact = reading.read_stamps(path, stamp, received, unit)
     if exact is not None:
-        return _from_stamps(path, *exact, period, warm_up)
-    log, row = reading.resample(reading.read_signals(path, time, commands, observations, episode, unit))
-    warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
-    return _correlated(path, log, row, period or row, longest, warm, seed)
+        estimated = _from_stamps(path, *exact, period, warm_up)
+    else:
+        log, row = reading.resample(reading.read_signals(path, time, commands, observations, episode, unit))
+        warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
+        estimated = _correlated(path, log, row, period or row, longest, warm, seed)
+    if estimated.row > SLOW and unit == "s":
+        line = f"the rows of {path} lie {estimated.row:.3g} s apart: if its time stamps are in milliseconds, say so"
+        warnings.warn(f"{line} (--unit ms)", DelayWarning, stacklevel=2)
+    return estimated
 
 
 def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, warm_up: float | None) -> Estimated:

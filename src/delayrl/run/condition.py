@@ -107,6 +107,10 @@ class Setup:
         """Return how many units of `replay_capacity` a row of the replay takes under the protocol."""
         return self.agent.ahead(spec) if self.protocol.capacity == "entries" else 1
 
+    def replay_rows(self, spec: Spec) -> int:
+        """Return the rows of each seed's replay."""
+        return self.schedule.replay_capacity // self.entries(spec)
+
     def cell_id(self, seeds: Sequence[int]) -> str:
         """Return the name of a group of seeds: a hash of the configuration, however the user wrote it."""
         return _digest(self._decisive | {"seeds": list(seeds)})

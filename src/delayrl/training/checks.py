@@ -1,20 +1,23 @@
 """What is refused before anything is stored or deleted."""
 
+import warnings
 from importlib.util import find_spec
 
 import jax
+import numpy as np
 
 from delayrl.agents.base import State, template
 from delayrl.core import replay as ring
 from delayrl.core.types import Spec
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import Setup
+from delayrl.training.actor import Actor
 from delayrl.training.machine import free_memory, uses_accelerator
 from delayrl.training.state import Ways
 from delayrl.training.tracking import SERVICES
 from delayrl.wrappers import Delayed
-from delayrl.wrappers.single import check_limit
+from delayrl.wrappers.single import check_limit, name_of
 
 
 def check_ways(ways: Ways) -> None:
@@ -32,7 +35,7 @@ def check_ways(ways: Ways) -> None:
 
 def replay_bytes(setup: Setup, spec: Spec) -> int:
     """Return the size of one seed's replay."""
-    replay = jax.eval_shape(lambda: ring.init(spec, setup.schedule.replay_capacity // setup.entries(spec)))
+    replay = jax.eval_shape(lambda: ring.init(spec, setup.replay_rows(spec)))
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(replay))
 
 
@@ -65,3 +68,13 @@ def check_fit(setup: Setup, env: Delayed) -> State:
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
     check_limit(env, str(setup.task))
     return template(agent, spec)
+
+
+def check_repeats(actor: Actor) -> None:
+    """Warn if an episode of an actor at its beginning, begun again from its seed, begins otherwise."""
+    first = actor.truth
+    actor.start_episode(0)
+    if not np.array_equal(actor.truth, first):
+        name = name_of(actor.env)
+        line = f"{name} does not begin an episode twice in the same way from one seed (`super().reset(seed=seed)`)"
+        warnings.warn(f"{line}: a run on it cannot be repeated, nor go on after a stop", DelayWarning, stacklevel=4)

@@ -19,6 +19,8 @@ def estimate(group: Group, state: TrainState) -> str:
     hours, steps = _seconds(group, state) / 3600, group.setup.schedule.steps - state.step
     if math.isnan(hours):
         return f"none for {steps:,} steps, because how often a loop of the updates runs depends on data"
+    if hours < 1 / 120:
+        return f"less than a minute for {steps:,} steps on this device"
     if hours < 0.5:
         return f"about {max(1, round(hours * 60))} min for {steps:,} steps on this device"
     advice = "; --preset small takes minutes" if group.setup.condition.preset == "paper" else ""

@@ -74,7 +74,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
 
 def _fresh(group: Group, actors: list[Actor], note: Callable[[str], None]) -> TrainState:
     """Return the state in which a run begins, with the networks of another run as far as they fit, if there is one."""
-    learner = group.program.init(group.keys, group.replay_rows)
+    learner = group.program.init(group.keys, group.setup.replay_rows(group.spec))
     if group.source is not None:
         learner = learner._replace(agent=taken_over(learner.agent, group.source, note))
     return _nothing_stored(0, learner, actors)
@@ -135,7 +135,8 @@ def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) ->
     """Return the state in the seeds' checkpoints. Raises DelayRLError if one does not fit, or an episode differs."""
     states = [restore_tree(group.template, c.arrays("agent"), c.path) for c in checkpoints]
     agent = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
-    step, shapes = checkpoints[0].step, jax.eval_shape(lambda: ring.init(group.spec, group.replay_rows))
+    step, rows = checkpoints[0].step, group.setup.replay_rows(group.spec)
+    shapes = jax.eval_shape(lambda: ring.init(group.spec, rows))
     columns = {name: np.zeros((len(actors), *x.shape), x.dtype) for name, x in shapes._asdict().items()}
     if step >= group.setup.schedule.steps:  # it learns no more, and its replay stays empty
         return _nothing_stored(step, Learner(agent, ring.Replay(**columns)), actors)  # type: ignore[arg-type]
@@ -189,7 +190,7 @@ def save(group: Group, state: TrainState, *, complete: bool = False) -> TrainSta
         if complete and group.ways.slim:
             run.save(state.step, weights, None, {}, complete=True)
             continue
-        own, until = _save_replay(run, state, i, group.replay_rows)
+        own, until = _save_replay(run, state, i, group.setup.replay_rows(group.spec))
         run.save(state.step, weights, _loop_arrays(group, state, i), own, complete=complete)
         run.drop_pieces()
         pieces.append(own)

@@ -48,11 +48,6 @@ class Group:
     source: Checkpoint | None = None  # of another run, whose networks training begins with
     further: bool = False  # whether these are runs of fewer steps, which go on
 
-    @property
-    def replay_rows(self) -> int:
-        """The rows of each seed's replay."""
-        return self.setup.schedule.replay_capacity // self.setup.entries(self.spec)
-
 
 @dataclass
 class TrainState:

@@ -26,7 +26,7 @@ from delayrl.run.condition import Setup, resolve
 from delayrl.run.folder import RunFolder, RunLike, hold, path_of
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
-from delayrl.training.checks import check_fit, check_memory, check_ways
+from delayrl.training.checks import check_fit, check_memory, check_repeats, check_ways
 from delayrl.training.learner import compiled
 from delayrl.training.loop import run
 from delayrl.training.machine import shared
@@ -155,6 +155,7 @@ def train_group(
             note("delay: none")
         elif given is not None and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
+        check_repeats(actors[0])
         state = start(group, actors, overwrite, note)
         if state.step == 0 and (lines := shared(numbers, folders, ways.device)):
             note(lines)
