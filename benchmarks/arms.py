@@ -23,7 +23,7 @@ from floor import filled, update
 
 from delayrl.bench.grid import load_grid
 from delayrl.core.precision import setting
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import Condition, resolve
 from delayrl.run.provenance import versions

@@ -16,6 +16,7 @@ import ladder
 import lost
 import matplotlib
 import numpy as np
+import sweeps
 import which
 
 matplotlib.use("Agg")
@@ -28,7 +29,7 @@ from speed import tables as speed
 from delayrl.agents.base import Agent
 from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
 from delayrl.report.markdown import markdown_table
 from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
@@ -130,29 +131,6 @@ def table(name: str) -> str:
         cells += [seeds, evaluation["delay"], f"{config['schedule']['steps']:,}"]
         body.append(cells)
     return markdown_table(titles, body)
-
-
-def draw_against_delay(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
-    """Draw return against delay for the same policies: the mean over seeds, and a thin line for each seed."""
-    lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
-    returns: dict[str, dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
-    for line in lines:
-        if "sweep" in line and line["sweep"]["agent"] in labels:
-            result = line["sweep"]
-            returns[result["agent"]][line["run"]][result["delay"]] = result["mean_return"]
-    figure, axes = pyplot.subplots(figsize=(7.5, 4), layout="constrained")
-    for agent, runs in returns.items():
-        delays = sorted(next(iter(runs.values())))
-        seeds = np.array([[run[delay] for delay in delays] for run in runs.values()])
-        axes.plot(delays, seeds.T, color=COLOURS[agent], alpha=0.25, linewidth=1)
-        axes.plot(delays, seeds.mean(0), color=COLOURS[agent], linewidth=2.2, marker="o", label=labels[agent])
-    axes.set(xlabel="constant delay in evaluation (steps)", ylabel="return", title=title)
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    figure.savefig(out, dpi=140)
-    pyplot.close(figure)
 
 
 def provenance(name: str) -> str:
@@ -326,9 +304,9 @@ def main() -> None:
     draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", balanced)
     draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | more)
     if (HERE / "results" / "pusher-random.jsonl").exists():
-        labels = {agent: agent for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
         title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
-        draw_against_delay("pusher-random", title, images / "pusher-delays.png", labels)
+        shown = {agent: COLOURS[agent] for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
+        sweeps.draw(sweeps.read(HERE / "results" / "pusher-random.jsonl"), title, images / "pusher-delays.png", shown)
     for name, pages in {
         "pendulum": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
         "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.envs import make as make_task
+from delayrl.envs.making import make as make_task
 from delayrl.errors import DelayRLError
 from delayrl.measure import from_log
 from delayrl.measure.reading import read_signals

@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from delayrl.envs import quiet
+from delayrl.envs.task import quiet
 from delayrl.run.provenance import versions
 from delayrl.wrappers import AugmentedObservation, AugmentedVectorObservation, Delayed, DelayedVector
 

@@ -51,7 +51,7 @@ from delayrl.agents.lifting import Lifting  # noqa: E402
 from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
 from delayrl.delays import Delay  # noqa: E402
-from delayrl.envs import make  # noqa: E402
+from delayrl.envs.making import make  # noqa: E402
 from delayrl.play.run import Run  # noqa: E402
 from delayrl.training.actor import Actor  # noqa: E402
 from delayrl.training.learner import Learner, Program, Stored  # noqa: E402

@@ -45,9 +45,6 @@ class Shrink:
         actor = jax.tree.map(lambda weights: self.factor * weights, state.actor)
         return State(actor, state.updates + 1), {"updates": state.updates}
 
-    def reference_policy(self, state):
-        return None
-
     def deterministic(self, state):
         return Deterministic(self.sees, state.actor)
 
@@ -75,14 +72,14 @@ class Wordy(Shrink):
 @dataclass
 class Thawed:
     privileged = False
-    ahead = phases = init = act = reference_policy = deterministic = None
+    ahead = phases = init = act = deterministic = None
 
 
 @dataclass(frozen=True)
 class Needy:
     width: Annotated[int, "has no default"]
     privileged = False
-    ahead = phases = init = act = reference_policy = deterministic = None
+    ahead = phases = init = act = deterministic = None
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from delayrl.core import replay as ring
 from delayrl.core.precision import setting
 from delayrl.core.types import Spec, Transition
 from delayrl.delays import Delay
-from delayrl.envs import delay_of, make
+from delayrl.envs.making import delay_of, make
 from delayrl.play.policy import spec_of
 from delayrl.run.configuration import override
 from delayrl.training.actor import Actor

@@ -19,7 +19,7 @@ class RunPolicy:
     def __init__(self, path: Path) -> None:
         import delayrl
         from delayrl import Run
-        from delayrl.envs import make
+        from delayrl.envs.making import make
         from delayrl.wrappers.single import seconds_of
 
         self._policy = delayrl.load(path)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from delayrl.delays import Delay as Delay
     from delayrl.delays import as_delay as as_delay
     from delayrl.deploy.export import export_run as export_run
-    from delayrl.envs import make as make
+    from delayrl.envs.making import make as make
     from delayrl.errors import DelayRLError as DelayRLError
     from delayrl.errors import DelayWarning as DelayWarning
     from delayrl.errors import StoppedError as StoppedError
@@ -51,7 +51,7 @@ _HOME = {
     "evaluate": "play.evaluation",
     "export_run": "deploy.export",
     "load": "play.policy",
-    "make": "envs",
+    "make": "envs.making",
     "runs": "play.run",
     "sweep": "play.evaluation",
     "go_on": "training.further",

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 from conftest import learned, record
+from delayrl.agents.base import reference_of
 from delayrl.agents.dcac import DCAC, Roll, values
 from delayrl.core import networks
 from delayrl.core import replay as ring
@@ -292,7 +293,7 @@ def test_act() -> None:
     other = AGENT.act(state, seen._replace(actions=-seen.actions), jax.random.key(0), explore=False)
     assert not np.array_equal(mode, other)
     assert not AGENT.privileged
-    assert AGENT.reference_policy(state) is None
+    assert reference_of(AGENT, state) is None
     with pytest.raises(DelayRLError, match="at least 1 step"):
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
 

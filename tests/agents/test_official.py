@@ -17,7 +17,7 @@ from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.protocol import CORRECTED
 from delayrl.core.types import Spec
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import resolve
 from delayrl.training.actor import Actor

@@ -15,7 +15,7 @@ import delayrl
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid
 from delayrl.bench.results import cells_done, collect, read_table, rows_of, versions_of
-from delayrl.bench.status import standing, status
+from delayrl.bench.status import progress, standing
 from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
 from delayrl.run import provenance
@@ -73,7 +73,7 @@ def test_round_trip(finished, tmp_path: Path) -> None:
     assert {row["configuration"] for row in rows} == {config["configuration"] for config in configs}
     assert configs[0]["cost"] == {"parameters": 0, "gradient_steps": {}, "batches": [], "flops": 0.0}
     assert [(p.state, p.step) for _, p in cells] == [("done", 60), ("todo", 0)]
-    assert [status(cell, runs) for cell in grid.cells] == ["done", "todo"]
+    assert [progress(cell, runs).state for cell in grid.cells] == ["done", "todo"]
 
 
 def test_the_same_rows_give_the_same_bytes(finished, tmp_path: Path) -> None:
@@ -290,7 +290,7 @@ def test_worker(finished, tmp_path: Path) -> None:
         assert [event["event"] for event in folders.journal(home)] == ["begun", "done"]
     with folders.hold(home):
         assert work(home).kind == "locked"
-        assert status(grid.cells[0], runs) == "running"
+        assert progress(grid.cells[0], runs).state == "running"
     wrong = replace(grid.cells[0], id="89ab", condition=replace(grid.cells[0].condition, delay=51))
     assert work_on(wrong, tmp_path).kind == "failed"
     assert "longer than an episode" in work(tmp_path / wrong.folder).line

@@ -264,6 +264,7 @@ def test_channels_of_a_text() -> None:
         ("2+reward=3@raw", "newest, fifo or wait"),
         ("recorded:nowhere.csv", "No such file"),
         ("recorded:a+b@c.csv", "a\\+b@c.csv"),
+        ("recorded:a/+b=c/d.csv", "No such file"),
         ("recorded", "takes values after a colon"),
         ("episode", "takes values after a colon"),
         ("-1~", "not negative"),
@@ -354,11 +355,13 @@ def test_recordings_in_odd_forms(tmp_path: Path) -> None:
 
 
 def test_shorthands() -> None:
-    assert Delay(observation=3, action="2") == as_delay("3+action=2")  # type: ignore[arg-type]
+    assert Delay(observation=3, action=2) == as_delay("3+action=2")  # type: ignore[arg-type]
     assert Channel(3) == Channel(Constant(3))  # type: ignore[arg-type]
     assert as_delay(" 2 + action = 1 ") == as_delay("2+action=1")
     with pytest.raises(DelayRLError, match="as_delay"):
         Channel("uniform:1:3")  # type: ignore[arg-type]
+    with pytest.raises(DelayRLError, match="as_delay"):
+        Delay(action="2")  # type: ignore[arg-type]
     assert poisson(1000, 3).probabilities[3] > 0.99
     assert len(str(as_delay("choice:" + ",".join(f"{i}={1 / 50!r}" for i in range(50))).label())) < 60
 

@@ -13,7 +13,7 @@ from delayrl import load, make
 from delayrl.cli.main import main
 from delayrl.deploy import Controller, export_run, load_bundle
 from delayrl.deploy.latency import ages_of, latency
-from delayrl.envs import tasks
+from delayrl.envs.making import tasks
 from delayrl.errors import DelayRLError
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder

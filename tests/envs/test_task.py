@@ -13,7 +13,7 @@ from gymnasium.wrappers import NormalizeObservation, TimeLimit
 
 import delayrl
 import own_tasks
-from delayrl.envs import delay_of
+from delayrl.envs.making import delay_of
 from delayrl.envs.task import Part, Task, as_task, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import resolve

@@ -18,7 +18,7 @@ from delayrl import DelayRLError, DelayWarning
 from delayrl.cli.console import seconds
 from delayrl.cli.main import main
 from delayrl.delays import as_delay
-from delayrl.envs import quiet
+from delayrl.envs.task import quiet
 from delayrl.measure import from_log, probe
 from delayrl.measure.log import rounded_up_steps
 from delayrl.measure.reading import read_signals

@@ -10,7 +10,7 @@ import pytest
 
 import delayrl
 from delayrl.core.types import Seen, Spec
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.evaluation import EVALUATION, HELD_OUT, RANDOM_ACTIONS, TRAINING, Evaluator, evaluate, reset_seed
 from delayrl.play.run import Run
 from own_tasks import failing

@@ -1,13 +1,18 @@
 """A loaded policy acts in the task's units, and refuses what it was not trained for."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
 import delayrl
+from delayrl.core.types import Spec
 from delayrl.play.evaluation import evaluate
+from delayrl.play.policy import Policy
 from delayrl.play.run import Run
 from short_runs import train
 
@@ -44,6 +49,17 @@ def test_policy_in_other_units(tmp_path: Path) -> None:
         np.testing.assert_allclose(action, 2 * inner, atol=1e-4)
         obs, _, _, _, info = env.step(action)
         obs2, _, _, _, info2 = scaled.step(inner)
+
+
+def test_an_action_is_in_the_tasks_range() -> None:
+    """A task in double precision, whose range single precision does not hold, refuses what lies beyond."""
+    space = Box(-0.1, np.float64([0.3, 0.7, 0.9]), (3,), np.float64)
+    for sign in (-1, 1):
+        agent = SimpleNamespace(act=lambda state, seen, key, explore, sign=sign: jnp.full(3, sign, jnp.float32))
+        policy = Policy(agent, None, Spec(1, 3, 0), space.low, space.high)  # type: ignore[arg-type]
+        action = policy.act(np.zeros(1), {"age": 0, "actions": []})
+        assert space.contains(action.astype(np.float64))
+        np.testing.assert_allclose(action, space.high if sign > 0 else space.low, rtol=1e-6)
 
 
 def test_policy_refuses_what_it_does_not_know(vdpo: Run) -> None:

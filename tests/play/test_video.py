@@ -16,7 +16,7 @@ from PIL import Image, ImageSequence
 
 import delayrl.play.video as video
 from delayrl.delays import as_delay
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import HELD_OUT, reset_seed
@@ -38,7 +38,7 @@ import numpy as np
 from gymnasium.envs.mujoco.ant_v5 import AntEnv
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.picture import close, render
 from delayrl.play.video import _episode
 

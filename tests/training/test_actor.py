@@ -11,7 +11,7 @@ import delayrl
 from delayrl.agents.registry import AGENTS
 from delayrl.core.protocol import Protocol
 from delayrl.delays import as_delay
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.evaluation import TRAINING, reset_seed
 from delayrl.training.actor import Actor
 from delayrl.training.loop import hidden_steps

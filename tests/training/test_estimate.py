@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import resolve
 from delayrl.training import estimate as module

@@ -179,11 +179,20 @@ def test_a_run_from_another_goes_on_although_that_one_was_trained_further(tmp_pa
     origin = new.config["origin"]
     delayrl.go_on(old, 300, progress=False)
     assert train("bpql", tmp_path / "new", steps=200, start_from=old).config["origin"] == origin
-    other = train("bpql", tmp_path / "other", steps=200, hidden=(16,))
-    with pytest.raises(delayrl.DelayRLError, match="holds a run that began otherwise"):
-        train("bpql", tmp_path / "new", steps=200, start_from=other)
+    for steps in (200, 300):
+        other = train("bpql", tmp_path / f"other{steps}", steps=steps, hidden=(16,))
+        with pytest.raises(delayrl.DelayRLError, match="holds a run that began otherwise"):
+            train("bpql", tmp_path / "new", steps=200, start_from=other)
     again = train("bpql", tmp_path / "new", steps=200, start_from=old, overwrite=True)
     assert again.config["origin"]["from"]["step"] == 300
+
+
+def test_a_run_goes_on_although_the_newest_checkpoint_of_its_source_is_damaged(tmp_path: Path) -> None:
+    train("bpql", tmp_path / "old", steps=300, callback=lambda step, runs: step == 200)  # unfinished, it keeps two
+    new = train("bpql", tmp_path / "new", steps=200, start_from=tmp_path / "old")
+    weights = newest(tmp_path / "old").path / "agent.safetensors"
+    weights.write_bytes(weights.read_bytes()[:100])
+    assert train("bpql", tmp_path / "new", steps=200, start_from=tmp_path / "old").config == new.config
 
 
 def test_networks_of_another_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

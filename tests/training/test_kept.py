@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import delayrl
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
 from delayrl.run.folder import RunFolder, hold
 from delayrl.training import checks, machine

@@ -13,7 +13,7 @@ from delayrl.core import replay as ring
 from delayrl.core.protocol import CORRECTED, Protocol
 from delayrl.core.types import Spec
 from delayrl.delays import as_delay
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.training import loop
 from delayrl.training.actor import Actor
 from delayrl.training.learner import Stored

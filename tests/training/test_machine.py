@@ -1,12 +1,10 @@
 """What this machine has, and how seeds are shared between its cores."""
 
-import functools
 import os
 from pathlib import Path
 
 import pytest
 
-from delayrl.run.folder import RunFolder
 from delayrl.training import machine
 
 
@@ -34,23 +32,12 @@ def test_containers_have_less(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system does not pin processes")
 def test_several_seeds_are_told_how_they_would_be_faster(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each seed is in one command, each command on a core that this process may use."""
     monkeypatch.setattr(machine, "entry_points", lambda group: [])
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4, 6, 7, 9, 11})
-    monkeypatch.setattr(machine, "limit", lambda name: "")
-    folders = [RunFolder(Path(f"runs/x/seed{seed}")) for seed in (3, 4, 5, 6, 7)]
-    shared = functools.partial(machine.shared, folders=folders)
-    assert [line for line in shared([3, 4, 5, 6, 7], device=None).splitlines() if "taskset" in line] == [
-        "  taskset -c 4 delayrl train … --seed 3 --seeds 1 --out runs/x/seed3 &",
-        "  taskset -c 11 delayrl train … --seed 7 --seeds 1 --out runs/x/seed7 &",
-    ]
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4, 6})
-    assert shared([3, 4, 5, 6, 7], device="cpu").splitlines()[1:3] == [
-        "  taskset -c 4 delayrl train … --seed 3 --seeds 3 --out runs/x &",
-        "  taskset -c 6 delayrl train … --seed 6 --seeds 2 --out runs/x &",
-    ]
-    assert shared([3], device=None) == shared([3, 5], device=None) == ""
+    monkeypatch.setattr(machine, "limit", lambda name: "")
+    assert machine.shared(5, device="cpu").startswith("seeds: 5 share one process; 2 processes of one core each")
+    assert machine.shared(1, device=None) == ""
     monkeypatch.setattr(machine, "entry_points", lambda group: ["cuda"])
-    assert shared([3, 4], device=None) == shared([3, 4], device="gpu") == ""
+    assert machine.shared(2, device=None) == machine.shared(2, device="gpu") == ""
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4})
-    assert shared([3, 4], device="cpu") == ""
+    assert machine.shared(2, device="cpu") == ""

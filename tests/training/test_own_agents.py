@@ -217,7 +217,7 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
     [
         ("own_agents:make", "own_agents:make is no agent, because it is no dataclass"),
         ("own_agents:Shrunk", "module 'own_agents' has no 'Shrunk'; did you mean Shrink"),
-        ("own_agents:Half", "because it lacks ahead, phases, init, act, reference_policy, deterministic"),
+        ("own_agents:Half", "because it lacks ahead, phases, init, act, deterministic"),
         ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
         ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
         ("own_agents:Steps", "has an option steps, as every run has"),

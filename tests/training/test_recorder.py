@@ -10,7 +10,7 @@ import pytest
 from delayrl.agents.random import Random
 from delayrl.core.types import Spec
 from delayrl.delays import as_delay
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import EVALUATION, Episodes, reset_seed
 from delayrl.run.condition import resolve

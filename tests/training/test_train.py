@@ -12,7 +12,7 @@ import pytest
 import delayrl
 from conftest import quick
 from delayrl.core.precision import FEW
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.play.evaluation import Evaluator
 from delayrl.play.run import Run
 from delayrl.run.condition import resolve

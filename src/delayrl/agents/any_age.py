@@ -13,7 +13,7 @@ What it takes from whom stands in docs/algorithms/any-age.md.
 
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from delayrl.agents import sac
-from delayrl.agents.base import Agent, Deterministic, Phase, Schedule
+from delayrl.agents.base import Deterministic, Phase, Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
@@ -67,10 +67,6 @@ class AnyAge:
     def phases(self) -> tuple[Phase, ...]:
         """Return one phase, the update."""
         return (self.bpql.phases()[0]._replace(update=self.update),)
-
-    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """Return None: the delay-free policy is the same network at age 0 (`delayrl evaluate --sweep`)."""
-        return None
 
     def for_run(self, schedule: Schedule) -> "AnyAge":
         """Return the agent with the length of its run. Raises DelayRLError for options that contradict each other."""

@@ -70,17 +70,14 @@ class Agent(Protocol):
     def phases(self) -> tuple[Phase, ...]:
         """Return the agent's updates, each with its schedule."""
 
-    # An agent that depends on the run's schedule also has `for_run(schedule)`, which returns the agent for such a run,
-    # or raises DelayRLError.
+    # Two methods are optional. `for_run(schedule)` returns the agent for a run of a schedule, or raises DelayRLError.
+    # `reference_policy(state)` returns the delay-free agent that this one learns too, and its state, or None.
 
     def init(self, spec: Spec, key: Key) -> State:
         """Return a fresh state. Raises DelayRLError if the agent does not support the task."""
 
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """Return an action in [-1, 1]: with `explore` for training, else for evaluation, where `seen.truth` is None."""
-
-    def reference_policy(self, state: State) -> "tuple[Agent, State] | None":
-        """Return the delay-free policy that the agent also learns, if any; it is evaluated without delay."""
 
     def deterministic(self, state: State) -> Deterministic:
         """Return the deterministic policy as networks. Raises DelayRLError if there is none."""
@@ -110,6 +107,12 @@ def template(agent: Agent, spec: Spec) -> State:
     """Return the shapes and types of the agent's state without computing it. Raises what `init` raises."""
     key = jax.eval_shape(lambda: jax.random.key(0))  # also only a shape: no device is touched
     return jax.eval_shape(functools.partial(agent.init, spec), key)
+
+
+def reference_of(agent: Agent, state: State) -> tuple[Agent, State] | None:
+    """Return the delay-free policy that an agent also learns, if any; it is evaluated without delay."""
+    reference_policy = getattr(agent, "reference_policy", None)
+    return reference_policy and reference_policy(state)
 
 
 def descend(

@@ -15,14 +15,14 @@ Deviations from the paper and from the released code are numbered in docs/algori
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from delayrl.agents.base import Agent, Deterministic, Phase, descend
+from delayrl.agents.base import Deterministic, Phase, descend
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import k_step_return, soft_target, temperature_loss
@@ -80,10 +80,6 @@ class DCAC:
     def phases(self) -> tuple[Phase, ...]:
         """Return one phase: an update at every step."""
         return (Phase(1, 1, self.batch_size, self.update),)
-
-    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """Return None: the agent learns no delay-free policy."""
-        return None
 
     def init(self, spec: Spec, key: Key) -> State:
         """Initialise the networks. The target critics start as copies."""

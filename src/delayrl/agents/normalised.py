@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from delayrl.agents.base import Agent, Deterministic, Phase
+from delayrl.agents.base import Agent, Deterministic, Phase, reference_of
 from delayrl.agents.base import State as AgentState
 from delayrl.core.networks import Params
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
@@ -70,7 +70,7 @@ class NormalisedObservations:
 
     def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
         """Return the inner agent's delay-free policy, if it has one, on normalised observations."""
-        inner = self.agent.reference_policy(state.agent)
+        inner = reference_of(self.agent, state.agent)
         return inner and (NormalisedObservations(inner[0]), State(inner[1], state.moments))
 
     def deterministic(self, state: State) -> Deterministic:

@@ -1,13 +1,13 @@
 """The random policy: uniform actions. Its return is the lower anchor of normalised returns (VDPO §5: Ret_rand)."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from delayrl.agents.base import Agent, Deterministic, Phase
+from delayrl.agents.base import Deterministic, Phase
 from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.errors import DelayRLError
 
@@ -31,10 +31,6 @@ class Random:
     def phases(self) -> tuple[Phase, ...]:
         """Return no phases: nothing is learned."""
         return ()
-
-    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """Return None: the agent learns no delay-free policy."""
-        return None
 
     def init(self, spec: Spec, key: Key) -> State:
         """Return a state with the action size."""

@@ -16,14 +16,14 @@ Deviations are numbered in docs/algorithms/sac.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from delayrl.agents.base import Agent, Deterministic, Phase, descend
+from delayrl.agents.base import Deterministic, Phase, descend
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian, LogStdBounds, Norm, Params
 from delayrl.core.objectives import k_step_return, soft_target, soft_value, temperature_loss
@@ -91,10 +91,6 @@ class SAC:
     def phases(self) -> tuple[Phase, ...]:
         """Return one phase, the update."""
         return (Phase(self.update_every, self.updates, self.batch_size, self.update),)
-
-    def reference_policy(self, state: State) -> tuple[Agent, Any] | None:
-        """Return None: the agent learns no delay-free policy."""
-        return None
 
     def init(self, spec: Spec, key: Key) -> State:
         """Initialise the networks. The target critics start as copies."""

@@ -41,7 +41,6 @@ def wrap(
     keys: Sequence[str] = (),
     augment: bool = True,
     step_seconds: float | None = None,
-    training_wrap: Callable[..., Any] | None = None,
 ) -> "DelayWrapper":
     """Wrap a task for training, with delays: give `partial(wrap, delay=...)` as `wrap_env_fn` of brax's PPO.
 
@@ -54,7 +53,6 @@ def wrap(
         keys: as for `DelayWrapper`.
         augment: as for `DelayWrapper`.
         step_seconds: the length of a decision, for delays in time; None for the task's `dt` times `action_repeat`.
-        training_wrap: the wrapper for training that goes inside; None for the one of brax or MuJoCo Playground.
 
     Raises:
         DelayRLError: no task of brax, or one that is wrapped for training; a bad delay, or one that is longer than an
@@ -74,9 +72,8 @@ def wrap(
     longest, decisions = max(delay.maximum, delay.reward.maximum), -(-episode_length // action_repeat)
     if longest > decisions:
         raise DelayRLError(f"a delay of {longest} steps is longer than an episode ({decisions} decisions)")
-    inside = training_wrap or _training_wrap(env)
     options = {"episode_length": episode_length, "action_repeat": action_repeat, "randomization_fn": randomization_fn}
-    return DelayWrapper(inside(env, **options), delay, keys=keys, augment=augment)
+    return DelayWrapper(_training_wrap(env)(env, **options), delay, keys=keys, augment=augment)
 
 
 def _wrappers(env: Any) -> Iterator[Any]:

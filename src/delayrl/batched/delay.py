@@ -10,8 +10,8 @@ from jaxtyping import Array, Int
 
 from delayrl.batched.laws import Law, PerEpisode, Range, axes, batched_law
 from delayrl.delays import Channel, DelayLike, Rule, as_delay
-from delayrl.delays.channels import StepSeconds
 from delayrl.delays.laws import whole_steps
+from delayrl.delays.text import StepSeconds
 from delayrl.errors import DelayRLError
 
 STATIC = {"static": True}

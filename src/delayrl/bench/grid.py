@@ -15,7 +15,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed

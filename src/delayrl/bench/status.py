@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 
 from delayrl.bench import folders
-from delayrl.run.cell import Cell, CellState, Progress, Standing
+from delayrl.run.cell import Cell, Progress, Standing
 
 HEAD = ("id", "agent", "task", "delay", "seeds", "state", "steps", "steps/s", "time left")
 
@@ -26,11 +26,6 @@ def progress(cell: Cell, runs: Path) -> Progress:
     if events and events[-1]["event"] == "failed":
         return Progress("failed", step, speed, str(events[-1].get("line", "")))
     return Progress("todo", step, speed)
-
-
-def status(cell: Cell, runs: Path) -> CellState:
-    """Read from disk whether a cell is to do, running, done or failed."""
-    return progress(cell, runs).state
 
 
 def standing(cells: Sequence[Cell], runs: Path) -> list[tuple[Cell, Progress]]:

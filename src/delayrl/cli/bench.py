@@ -9,7 +9,7 @@ from typing import Any
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
-from delayrl.bench.status import HEAD, closing_lines, duration, line, standing, status, table
+from delayrl.bench.status import HEAD, closing_lines, duration, line, progress, standing, table
 from delayrl.cli.console import StatusLine, print_table, whole
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell
@@ -88,7 +88,7 @@ def _plan(grid: Grid, given: argparse.Namespace) -> None:
     for cell, own in zip(grid.cells, changed, strict=True):
         condition = cell.condition
         setup = [f"preset {condition.preset}", f"{condition.steps:,} steps", *sorted(own - everywhere)]
-        print(f"{cell.id}  {status(cell, given.runs):<7}  {cell}, {', '.join(setup)}")
+        print(f"{cell.id}  {progress(cell, given.runs).state:<7}  {cell}, {', '.join(setup)}")
     if everywhere:
         print(f"\nall cells: {', '.join(sorted(everywhere))}")
     runs = sum(len(cell.seeds) for cell in grid.cells)
@@ -147,7 +147,7 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     if words and not any(folders.stored(given.runs / cell.folder, cell.seeds)[0] for cell in cells):
         print(words, file=sys.stderr)
     status_line = StatusLine(lambda elapsed: f"{duration(elapsed)}: {line(standing(cells, given.runs), workers)}")
-    with stop_signal() as stop:
+    with stop_signal(patient=True) as stop:  # its workers have a minute
         tries, limit, say, tick = given.tries, given.time_limit, status_line.say, status_line.update
         completion = run_cells(cells, given.runs, backend, tries=tries, time_limit=limit, stop=stop, say=say, tick=tick)
     status_line.clear()
@@ -193,7 +193,7 @@ def _backend(given: argparse.Namespace, grid: Grid) -> tuple[Any, int]:
 def _write_slurm(grid: Grid, cells: Sequence[Cell], given: argparse.Namespace) -> None:
     from delayrl.bench.backends import slurm
 
-    left = [cell for cell in cells if status(cell, given.runs) != "done"]
+    left = [cell for cell in cells if progress(cell, given.runs).state != "done"]
     if not left:
         print(f"{grid.name}: all {len(cells)} cells are done")
         return

@@ -58,7 +58,7 @@ def run(given: argparse.Namespace) -> None:
         if isinstance(given.longest, int):
             raise DelayRLError(f"--longest is a time such as 200ms in a log; got {given.longest}")
         options = {name: getattr(given, name) for name in (*COLUMNS, "period", "longest", "warm_up", "seed")}
-        result = from_log(given.target, **options, unit=given.unit or "s")
+        result = from_log(given.target, **options, unit=given.unit)
         if given.save:
             result.save(given.save)
         if given.plot:

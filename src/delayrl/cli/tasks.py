@@ -7,7 +7,7 @@ from delayrl.cli.console import print_table
 
 def run(given: argparse.Namespace) -> None:
     """Print a table of the tasks."""
-    from delayrl.envs import tasks
+    from delayrl.envs.making import tasks
 
     rows = []
     for name, env, seconds in tasks():

@@ -3,11 +3,8 @@
 from delayrl.delays.channels import PAPER_STOCHASTIC_5 as PAPER_STOCHASTIC_5
 from delayrl.delays.channels import Channel as Channel
 from delayrl.delays.channels import Delay as Delay
-from delayrl.delays.channels import DelayLike as DelayLike
 from delayrl.delays.channels import Rule as Rule
-from delayrl.delays.channels import as_delay as as_delay
 from delayrl.delays.channels import short_label as short_label
-from delayrl.delays.channels import stored_delay as stored_delay
 from delayrl.delays.episodes import PerEpisode as PerEpisode
 from delayrl.delays.episodes import any_phase as any_phase
 from delayrl.delays.episodes import unsynchronised as unsynchronised
@@ -22,4 +19,7 @@ from delayrl.delays.laws import poisson as poisson
 from delayrl.delays.laws import random_walk as random_walk
 from delayrl.delays.laws import uniform as uniform
 from delayrl.delays.recordings import recorded as recorded
+from delayrl.delays.text import DelayLike as DelayLike
+from delayrl.delays.text import as_delay as as_delay
+from delayrl.delays.text import stored_delay as stored_delay
 from delayrl.delays.units import in_other_unit as in_other_unit

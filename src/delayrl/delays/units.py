@@ -1,6 +1,7 @@
 """Delays in words: steps where a time was given, and a time where steps were."""
 
-from delayrl.delays.channels import Delay, DelayLike, as_delay
+from delayrl.delays.channels import Delay
+from delayrl.delays.text import DelayLike, as_delay
 from delayrl.errors import DelayRLError
 
 

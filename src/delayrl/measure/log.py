@@ -127,7 +127,7 @@ def from_log(
     episode: str | None = None,
     stamp: str | None = None,
     received: str | None = None,
-    unit: str = "s",
+    unit: str | None = None,
     longest: float | None = None,
     warm_up: float | None = None,
     seed: int = 0,
@@ -144,7 +144,7 @@ def from_log(
         stamp: column of the time when an observation was made, by default `stamp`. If there is a column `received` too,
             the delays are exact, and commands are ignored.
         received: column of the time when the observation arrived, by default `received`.
-        unit: of time stamps: s, ms, us or ns.
+        unit: of time stamps: s (the default), ms, us or ns.
         longest: the longest delay to look for, in seconds; by default 100 rows, or a tenth of a short log.
         warm_up: seconds to leave out at the start; by default a twentieth of the log.
         seed: of the bootstrap.
@@ -153,6 +153,7 @@ def from_log(
         DelayRLError: the log cannot be used, or shows no delay beyond chance.
     """
     path = Path(path)
+    given, unit = unit, "s" if unit is None else unit
     if unit not in reading.UNITS:
         raise DelayRLError(f"time stamps are in {', '.join(reading.UNITS)}; got {unit!r}")
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
@@ -165,7 +166,7 @@ def from_log(
         log, row = reading.resample(reading.read_signals(path, time, commands, observations, episode, unit))
         warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
         estimated = _correlated(path, log, row, period or row, longest, warm, seed)
-    if estimated.row > SLOW and unit == "s":
+    if estimated.row > SLOW and given is None:
         line = f"the rows of {path} lie {estimated.row:.3g} s apart: if its time stamps are in milliseconds, say so"
         warnings.warn(f"{line} (--unit ms)", DelayWarning, stacklevel=2)
     return estimated
@@ -305,14 +306,11 @@ def plot(estimated: Estimated, out: str | Path) -> None:
 
     The suffix of `out` sets the format. Raises DelayRLError if matplotlib does not know it.
     """
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
     if Path(out).suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
-        pyplot.close(figure)
         raise DelayRLError(f"--plot takes a .png, .svg or .pdf file; got {out}")
     if estimated.method == "stamps":
         axes.bar(list(estimated.counts), list(estimated.counts.values()), color="#1f6feb")
@@ -333,4 +331,3 @@ def plot(estimated: Estimated, out: str | Path) -> None:
         axes.legend(handles=lines, frameon=False)
     axes.set(title=f"{Path(estimated.path).name}: train with --delay {estimated.train_with}")
     figure.savefig(out, dpi=130)
-    pyplot.close(figure)

@@ -52,10 +52,14 @@ class Evaluator:
     ) -> None:
         served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
-        self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
-        check_fits(self._envs[0][0], spec)
-        check_limit(self._envs[0][0], str(as_task(env)))
         self._act = _compiled_act(agent)
+        self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
+        try:
+            check_fits(self._envs[0][0], spec)
+            check_limit(self._envs[0][0], str(as_task(env)))
+        except DelayRLError:
+            self.close()
+            raise
 
     def __call__(
         self,

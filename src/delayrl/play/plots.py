@@ -57,15 +57,11 @@ def _band(axes: Any, x: Sequence[float], values: Sequence[Any], colour: str, lab
 
 @contextmanager
 def _axes(path: Path) -> Iterator[Any]:
-    import matplotlib
+    from matplotlib.figure import Figure  # pyplot would take a notebook's backend from it
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
     yield axes
     axes.grid(alpha=0.25)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=130)
-    pyplot.close(figure)

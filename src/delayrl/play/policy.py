@@ -13,7 +13,7 @@ from delayrl.core.cache import keep_compiled
 from delayrl.core.types import Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, stored_delay
-from delayrl.envs import make
+from delayrl.envs.making import make
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, agent_of
@@ -29,7 +29,7 @@ class Policy:
         agent: its hyperparameters.
         state: its weights, a tree of arrays.
         spec: sizes of the task, and the longest age it was trained for.
-        low, high: the range of its actions, [A].
+        low, high: the range of its actions, [A], float32: no number of it is beyond the task's own.
         step: how many environment steps it has learned from; None if unknown.
     """
 
@@ -44,7 +44,9 @@ class Policy:
         step: int | None = None,
     ) -> None:
         self.agent, self.state, self.spec, self.step = agent, state, spec, step
-        self.low, self.high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+        below, above = np.asarray(low, np.float32), np.asarray(high, np.float32)
+        self.low = np.where(below < low, np.nextafter(below, np.float32(np.inf)), below)
+        self.high = np.where(above > high, np.nextafter(above, np.float32(-np.inf)), above)
         self._key = jax.random.key(seed)
         self._act = jax.jit(lambda state, seen, key: agent.act(state, seen, key, explore=False))
 

@@ -16,8 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from delayrl.delays import Delay, DelayLike
-from delayrl.envs import make
-from delayrl.envs.making import check_limit, name_of
+from delayrl.envs.making import check_limit, make, name_of
 from delayrl.envs.task import Task, TaskLike
 from delayrl.errors import DelayRLError, first_line
 from delayrl.play import stepping

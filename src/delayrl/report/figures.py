@@ -44,9 +44,6 @@ def styles(labels: Sequence[str]) -> dict[str, tuple[str, str, str]]:
 
 def draw(summary: Summary, out: Path) -> Mapping[tuple[Setting, str], list[str]]:
     """Draw everything that there are numbers for; returns file names by setting and kind: curves, delay, aggregates."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
     looks = {label: (summary.name(label), *style) for label, style in styles(summary.labels).items()}
     files: dict[tuple[Setting, str], list[str]] = defaultdict(list)
@@ -68,9 +65,10 @@ def draw(summary: Summary, out: Path) -> Mapping[tuple[Setting, str], list[str]]
 
 
 def _panels(lines: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
-    figure, panels = pyplot.subplots(lines, columns, figsize=size, layout="constrained", squeeze=False)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(lines, columns, squeeze=False)
     for panel in panels.flat:
         panel.grid(alpha=0.2)
         panel.spines[["top", "right"]].set_visible(False)
@@ -89,15 +87,12 @@ def _task_panels(results: list[Result]) -> tuple[Any, dict[str, Any]]:
 
 
 def _save(figure: Any, path: Path) -> None:
-    from matplotlib import pyplot
-
     lines: dict[str, Any] = {}
     for panel in figure.axes:
         lines |= {label: line for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     names = sorted(lines, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
     figure.legend([lines[key] for key in names], names, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110)
-    pyplot.close(figure)
 
 
 def _line(look: Look) -> dict[str, Any]:

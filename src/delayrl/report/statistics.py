@@ -107,12 +107,12 @@ def stratified_bootstrap(
     return (low, high) if known else (np.full_like(low, NAN), np.full_like(high, NAN))
 
 
-def mean_interval(values: ArrayLike, repetitions: int = REPETITIONS, seed: int = 0) -> tuple[float, float]:
+def mean_interval(values: ArrayLike) -> tuple[float, float]:
     """Estimate the 95 % interval of a mean by resampling its values; NaN with fewer than two."""
     x = np.asarray(values, float)
     if x.size < 2:
         return NAN, NAN
-    means = _resample(np.random.default_rng(seed), x, repetitions).mean(1)
+    means = _resample(np.random.default_rng(0), x, REPETITIONS).mean(1)
     low, high = np.percentile(means, expanded_percentiles([x.size]))
     return float(low), float(high)
 

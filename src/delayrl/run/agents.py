@@ -22,7 +22,7 @@ from delayrl.run.configuration import OLDER, check_names, options, override, val
 GROUP = "delayrl.agents"
 AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
-PARTS = ("privileged", "ahead", "phases", "init", "act", "reference_policy", "deterministic")
+PARTS = ("privileged", "ahead", "phases", "init", "act", "deterministic")
 """What the protocol `Agent` asks for."""
 
 

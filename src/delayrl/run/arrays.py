@@ -34,12 +34,17 @@ def load_arrays(path: Path) -> Arrays:
     return arrays  # type: ignore[no-any-return]
 
 
-def flatten_tree(tree: Any) -> Arrays:
-    """Return the leaves of a pytree by name."""
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Return the leaves of a pytree by name, in its order: "critic.0.w" for `tree.critic[0]["w"]`."""
     import jax
 
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def flatten_tree(tree: Any) -> Arrays:
+    """Return the leaves of a pytree as arrays by name."""
+    return {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
 
 
 def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
@@ -49,8 +54,7 @@ def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
     """
     import jax
 
-    leaves, form = jax.tree_util.tree_flatten_with_path(template)
-    expected = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    expected = named_leaves(template)
     arrays = {name if name in expected else OLD_NAME.sub(r"\1opt_state", name): x for name, x in arrays.items()}
     for name in sorted(expected.keys() ^ arrays.keys()):
         verb = "lacks" if name in expected else "has"
@@ -61,4 +65,4 @@ def restore_tree(template: Any, arrays: Arrays, where: Path) -> Any:
                 f"{where} belongs to another agent or configuration: {name} is {arrays[name].dtype}"
                 f"{list(arrays[name].shape)}, expected {leaf.dtype}{list(leaf.shape)}"
             )
-    return jax.tree_util.tree_unflatten(form, [arrays[name] for name in expected])
+    return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in expected])

@@ -49,7 +49,7 @@ class Checkpoint:
 
 def checkpoint_folders(run: Path) -> list[Path]:
     """Return the folders of a run's checkpoints, newest first."""
-    return sorted((run / "checkpoints").glob("[0-9]*"), reverse=True)
+    return sorted((path for path in (run / "checkpoints").glob("*") if path.name.isdigit()), reverse=True)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

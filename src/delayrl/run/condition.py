@@ -13,7 +13,7 @@ from delayrl.core.protocol import Protocol, opening_length
 from delayrl.core.replay import Learnable
 from delayrl.core.types import Spec
 from delayrl.delays import Delay, DelayLike, as_delay, short_label
-from delayrl.envs import delay_of
+from delayrl.envs.making import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, as_agent, find_agent

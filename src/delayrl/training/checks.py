@@ -9,10 +9,11 @@ import numpy as np
 from delayrl.agents.base import State, template
 from delayrl.core import replay as ring
 from delayrl.core.types import Spec
+from delayrl.envs.making import make
 from delayrl.errors import DelayRLError, DelayWarning
+from delayrl.play import stepping
 from delayrl.play.policy import spec_of
 from delayrl.run.condition import Setup
-from delayrl.training.actor import Actor
 from delayrl.training.machine import free_memory, uses_accelerator
 from delayrl.training.state import Ways
 from delayrl.training.tracking import SERVICES
@@ -70,11 +71,12 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     return template(agent, spec)
 
 
-def check_repeats(actor: Actor) -> None:
-    """Warn if an episode of an actor at its beginning, begun again from its seed, begins otherwise."""
-    first = actor.truth
-    actor.start_episode(0)
-    if not np.array_equal(actor.truth, first):
-        name = name_of(actor.env)
-        line = f"{name} does not begin an episode twice in the same way from one seed (`super().reset(seed=seed)`)"
-        warnings.warn(f"{line}: a run on it cannot be repeated, nor go on after a stop", DelayWarning, stacklevel=4)
+def check_repeats(setup: Setup) -> None:
+    """Warn if an environment does not begin twice in the same way from one seed. It is made for that, and closed."""
+    env = make(setup.task, setup.delay.observed(), rescale=True)
+    first, again = (stepping.reset(env, 0)[1]["truth"] for _ in range(2))
+    stepping.close(env)
+    if not np.array_equal(first, again):
+        why = "its reset has to call super().reset(seed=seed), and its wrappers to keep nothing over a reset"
+        line = f"{name_of(env)} does not begin an episode twice in the same way from one seed ({why})"
+        warnings.warn(f"{line}: a run on it cannot go on after a stop", DelayWarning, stacklevel=4)

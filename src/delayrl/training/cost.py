@@ -6,13 +6,13 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, Phase, Schedule, template
 from delayrl.core.types import Spec
+from delayrl.run.arrays import named_leaves
 from delayrl.run.cost import Cost
 from delayrl.training.products import Value, follow, traced_updates
 
@@ -27,7 +27,7 @@ def cost_of(agent: Agent, spec: Spec, schedule: Schedule) -> Cost:
     The steps of an optimiser are those that its state counts. One that counts none takes one at each update that
     changes its state.
     """
-    leaves = _named_leaves(template(agent, spec))
+    leaves = list(named_leaves(template(agent, spec)).items())
     trained = [x for name, x in leaves if not (OPTIMISER.fullmatch(name) or {"target", "moments"} & {*name.split(".")})]
     parameters = sum(math.prod(x.shape) for x in trained if jnp.issubdtype(x.dtype, jnp.floating))
     counters = _counters(leaves)
@@ -61,11 +61,6 @@ def update_counts(phase: Phase, first: int, last: int) -> NDArray[np.int32]:
     while end - begin > 1000 * STRIDE * stride:
         stride *= STRIDE
     return np.arange(begin, end, stride).astype(np.int32)
-
-
-def _named_leaves(state: Any) -> list[tuple[str, Any]]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves]
 
 
 def _counters(leaves: Sequence[tuple[str, Any]]) -> dict[int, str]:

@@ -88,7 +88,8 @@ class Loop:
 
     def step(self) -> None:
         """Act once in every environment, and learn from the steps before if a block of them is full."""
-        state, actions = self.state, self.choose()
+        state = self.state
+        actions = self.choose()
         if len(state.pending) == self.group.setup.schedule.updates_per_call:
             self.learn()
         actions, state.actions = np.asarray(actions), None

@@ -5,8 +5,6 @@ import re
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from delayrl.run.folder import RunFolder
-
 
 def cores() -> int:
     """Return how many cores this process may keep busy: those that it may run on, or a container's share of them."""
@@ -40,22 +38,13 @@ def uses_accelerator(device: str | None) -> bool:
     return device != "cpu" and bool(entry_points(group="jax_plugins"))
 
 
-def shared(seeds: list[int], folders: list[RunFolder], device: str | None) -> str:
+def shared(seeds: int, device: str | None) -> str:
     """Return in words how seeds would learn faster than in one process, or "" if that is best.
 
     Processes of one core each learn more in an hour than one that has all cores (docs/performance.md).
     """
-    number = min(cores(), len(seeds))
-    one_is_best = number == 1 or uses_accelerator(device) or not hasattr(os, "sched_getaffinity")
-    if one_is_best or seeds != list(range(seeds[0], seeds[0] + len(seeds))):
+    number = min(cores(), seeds)
+    if number == 1 or uses_accelerator(device) or not hasattr(os, "sched_getaffinity"):
         return ""
-    commands, first = [], 0
-    for i, core in enumerate(sorted(os.sched_getaffinity(0))[:number]):
-        share = len(seeds) // number + (i < len(seeds) % number)
-        out = folders[first].path if share == 1 else folders[first].path.parent
-        commands.append(f"  taskset -c {core} delayrl train … --seed {seeds[first]} --seeds {share} --out {out} &")
-        first += share
-    if number > 3:
-        commands[1:-1] = ["  …"]
-    line = f"seeds: {len(seeds)} share one process; {number} processes of one core each learn more in an hour:"
-    return "\n".join([line, *commands, "  or `delayrl bench run`, which does so by itself"])
+    faster = f"{number} processes of one core each learn more in an hour, and `delayrl bench run` starts them"
+    return f"seeds: {seeds} share one process; {faster}"

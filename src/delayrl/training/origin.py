@@ -19,16 +19,19 @@ RENAMED = (("", "reference."), ("", "delayed."), ("reference.", ""), ("delayed."
 def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], Checkpoint]:
     """Return what the configuration says of a run whose networks others begin with, and its newest checkpoint.
 
-    Of runs that have `begun` with it, this is what they say, although it may have been trained further since.
+    Of runs that have `begun` with it, this is what they say, although it may have been trained further since, or its
+    newest checkpoint may be damaged.
     """
     config, checkpoint = run.config, run.latest()
     names = ("agent", "env", "delay", "seed", "configuration")
     described = {name: config[name] for name in names if name in config}
     described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}
     stored = begun[0].config.get("origin", {}).get("from", {}) if begun and begun[0].checkpoints()[0] else {}
-    same = all(stored.get(name) == described.get(name) for name in ("agent", "env", "delay", "seed"))
-    further = same and (described["step"] > stored["step"] or described["networks"] == stored["networks"])
-    return stored if further else described, checkpoint
+    longer = "lengths" in config.get("origin", {})  # `go_on` has changed its configuration
+    decisive = names[:-1] if longer else names
+    known = bool(stored) and all(stored.get(name) == described.get(name) for name in decisive)
+    other = known and stored["step"] == described["step"] and stored["networks"] != described["networks"]
+    return stored if known and not other else described, checkpoint
 
 
 def taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:

@@ -5,10 +5,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from delayrl.agents.base import State
+from delayrl.agents.base import State, reference_of
 from delayrl.core.protocol import opening_length
 from delayrl.core.types import Metrics, Spec
-from delayrl.envs import physics
+from delayrl.envs.making import physics
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import EVALUATION, Evaluator, reset_seed
 from delayrl.training.resume import KEPT
@@ -34,7 +34,7 @@ class Recorder:
         task, delay = setup.task, setup.delay
         shape = (len(group.seeds), setup.schedule.evaluation_episodes, group.apply)
         self._evaluators = {"agent": Evaluator(setup.agent, group.spec, task, delay, *shape)}
-        if reference := setup.agent.reference_policy(agent):
+        if reference := reference_of(setup.agent, agent):
             spec = Spec(group.spec.obs_size, group.spec.action_size, 0)
             self._evaluators["reference"] = Evaluator(reference[0], spec, task, 0, *shape)
 
@@ -42,7 +42,7 @@ class Recorder:
         """Play the evaluation episodes of a step, write a row for each. Returns the mean returns in words."""
         group, protocol = self._group, self._group.setup.protocol
         states = {"agent": agent}
-        if reference := group.setup.agent.reference_policy(agent):
+        if reference := reference_of(group.setup.agent, agent):
             states["reference"] = reference[1]
         episodes = range(group.setup.schedule.evaluation_episodes)
         own = [[reset_seed(seed, EVALUATION, step, episode) for episode in episodes] for seed in group.seeds]

@@ -8,22 +8,23 @@ from types import FrameType
 
 
 @contextmanager
-def stop_signal() -> Iterator[threading.Event]:
+def stop_signal(*, patient: bool = False) -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C or SIGTERM sets. Off the main thread nothing sets it.
 
-    Nobody looks at the event while something compiles, so a second Ctrl-C ends the program. A second SIGTERM does not:
-    cluster schedulers send one to each process, and a runner another to its workers.
+    Nobody looks at the event during an evaluation, so a second Ctrl-C does what it did before, unless `patient`; Python
+    hears of none while XLA compiles. A second SIGTERM changes nothing: cluster schedulers send one to each process, and
+    a runner another to its workers.
     """
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
     signals = (signal.SIGINT, signal.SIGTERM)
-    handlers = {number: signal.getsignal(number) for number in signals}
+    handlers = {number: signal.getsignal(number) or signal.SIG_DFL for number in signals}
 
     def ask(number: int, _: FrameType | None) -> None:
         event.set()
-        if number == signal.SIGINT:
+        if number == signal.SIGINT and not patient:
             signal.signal(signal.SIGINT, handlers[signal.SIGINT])
 
     try:

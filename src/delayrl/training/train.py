@@ -148,15 +148,15 @@ def train_group(
         group = Group(setup, numbers, folders, keys, spec, shapes, program, ways, apply, source, further)
 
         def note(line: str) -> None:
-            if ways.progress:
+            if ways.progress and line:
                 tqdm.write(line, file=sys.stderr)
 
         if given is not None and not setup.delay.maximum:
             note("delay: none")
         elif given is not None and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
-        check_repeats(actors[0])
         state = start(group, actors, overwrite, note)
-        if state.step == 0 and (lines := shared(numbers, folders, ways.device)):
-            note(lines)
+        if state.step == 0:
+            check_repeats(setup)
+            note(shared(len(numbers), ways.device))
         run(group, state, note, stop.is_set)

@@ -426,17 +426,28 @@ def test_bad_settings_are_refused(arguments: dict, message: str) -> None:
         Controller(counting(), **arguments)
 
 
+class Direction:
+    """A policy without `dt`, whose action has no value at an observation of zeros, as that of the first call is."""
+
+    obs_size, max_age, low, high = 1, 3, np.float32([-1]), np.float32([1])
+
+    def __init__(self, action_size: int) -> None:
+        self.action_size = action_size
+
+    def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
+        with np.errstate(invalid="ignore"):
+            return obs / np.linalg.norm(obs)
+
+
 def test_what_is_no_policy_is_refused_at_once() -> None:
     """Not at the first command, when the plant waits for it."""
-
-    class Wrong(Counting):
-        def __call__(self, obs: np.ndarray, actions: np.ndarray, age: int) -> np.ndarray:
-            return np.full(2, np.nan)
-
-    with pytest.raises(DelayRLError, match=r"the policy's action must be 1 finite numbers; got \[nan, nan\]"):
-        Controller(Wrong(1, 3))
-    with pytest.raises(DelayRLError, match=r"a policy also says its obs_size, action_size, low, high, max_age, dt"):
+    with pytest.raises(DelayRLError, match=r"the policy's action must be 2 numbers; got shape \(1,\)"):
+        Controller(Direction(2))
+    with pytest.raises(DelayRLError, match=r"a policy also says its obs_size, action_size, low, high, max_age \(see"):
         Controller(np.sin)
+    controller = Controller(Direction(1))
+    controller.observe([2.0], 0)
+    assert controller.act() == 1
 
 
 def test_a_policy_may_overwrite_its_inputs() -> None:

@@ -103,13 +103,13 @@ class Controller:
         idle: ArrayLike | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if missing := [name for name in ControlPolicy.__annotations__ if not hasattr(policy, name)]:
+        if missing := [name for name in ControlPolicy.__annotations__ if name != "dt" and not hasattr(policy, name)]:
             raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}")
         if on_overrun not in get_args(OnOverrun):
             raise DelayRLError(f"on_overrun is hold, clip or raise; got {on_overrun!r}")
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
         self.action_delay = _action_delay(policy, action_delay)
-        self._clock = Clock(stamps, policy.dt if stamps == "seconds" and dt is None else dt, clock)
+        self._clock = Clock(stamps, getattr(policy, "dt", None) if stamps == "seconds" and dt is None else dt, clock)
         steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
@@ -119,7 +119,10 @@ class Controller:
         capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
         self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
         self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
-        _decide(policy, np.zeros(policy.obs_size), [], 0)
+        first = policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
+        if np.shape(first) != (policy.action_size,):
+            size = policy.action_size
+            raise DelayRLError(f"the policy's action must be {size} numbers; got shape {np.shape(first)}")
 
     @property
     def serves(self) -> str:
