@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
@@ -64,9 +65,33 @@ class Unseeded(Arm):
 
 def test_a_task_that_ignores_its_seed_is_named_at_the_start(tmp_path: Path) -> None:
     """Not hours later, when the run is stopped and cannot go on."""
-    line = "Unseeded does not begin an episode twice in the same way from one seed .* nor go on after a stop"
+    line = "Unseeded does not begin an episode twice in the same way from one seed .* cannot go on after a stop"
     with pytest.warns(delayrl.DelayWarning, match=line):
         train("random", tmp_path / "run", env=Unseeded, wrappers=[LIMIT])
+
+
+def test_environments_are_closed(tmp_path: Path) -> None:
+    """Whoever makes one, also where nothing is played. An environment may hold a window, a process or a robot."""
+    open_now: set[int] = set()
+
+    class Held(Arm):
+        def __init__(self) -> None:
+            super().__init__()
+            open_now.add(id(self))
+
+        def close(self) -> None:
+            open_now.discard(id(self))
+
+    held = lambda: gym.wrappers.TimeLimit(Held(), 50)  # noqa: E731
+    run = train("bpql", tmp_path / "run", env=held, seeds=2)[0]
+    assert not open_now
+    evaluate(run, 2, env=held)
+    delayrl.load(run, held)
+    assert not open_now
+    other = train("random", tmp_path / "other", env="Pendulum-v1", steps=200)
+    with pytest.raises(DelayRLError, match="the policy takes observations of size 3"):
+        evaluate(other.policy(), 2, env=held)
+    assert not open_now
 
 
 def test_a_function_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> None:
