@@ -328,7 +328,7 @@ def main() -> None:
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
-    for name, folder in {"first": "", "evidence-1": "evidence-1"}.items():
+    for name, folder in {"first": "", "evidence-1": "evidence-1", "evidence-2": "evidence-2"}.items():
         if (rows := HERE / "results" / f"{name}.sqlite").exists():
             delayrl(["bench", "report", str(rows), "--out", str(root / "docs" / "results" / folder)])
     if list((HERE / "results" / "learning").glob("*.jsonl")):

@@ -20,7 +20,7 @@ class RunPolicy:
         import delayrl
         from delayrl import Run
         from delayrl.envs.making import make
-        from delayrl.wrappers.single import seconds_of
+        from delayrl.wrappers.layers import seconds_of
 
         self._policy = delayrl.load(path)
         spec = self._policy.spec

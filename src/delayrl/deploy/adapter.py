@@ -7,6 +7,7 @@ ReLU and a tanh at the end, the actor of most libraries' SAC and TD3.
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import described, pack
 from delayrl.errors import DelayRLError
 from delayrl.wrappers import AugmentedObservation, Delayed
-from delayrl.wrappers.single import find_delayed, name_of
+from delayrl.wrappers.layers import layers_of, name_of
+from delayrl.wrappers.single import find_delayed
 
 SAMPLES, TOLERANCE = 200, 1e-4
 """Inputs on which layers are compared with the policy that they are of, and their largest error, of the range."""
@@ -105,18 +107,17 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
 
 
 def _layers_of(env: Any) -> tuple[Delayed, AugmentedObservation | None]:
-    delayed, augmented, layer = find_delayed(env), None, env
+    delayed, augmented = find_delayed(env), None
     if delayed is None:
         raise DelayRLError("adapt takes the environment that the policy was trained in, with its Delayed: got none")
     if not delayed.delay.action.constant:
         raise DelayRLError(f"a controller has one delay of the actions; got {delayed.delay.action}: use its longest")
-    while layer is not delayed:
+    for layer in takewhile(lambda layer: layer is not delayed, layers_of(env)):
         if isinstance(layer, AugmentedObservation):
             augmented = layer
         if not _keeps_all(layer):
             name = type(layer).__name__
             raise DelayRLError(f"{name} stands outside Delayed, where no controller runs it: put it inside")
-        layer = layer.env
     return delayed, augmented
 
 

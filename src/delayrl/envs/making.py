@@ -13,10 +13,10 @@ from delayrl.envs import paper
 from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task
 from delayrl.errors import DelayRLError, near_names
 from delayrl.wrappers import Delayed, check_spaces
-from delayrl.wrappers.single import check_length
-from delayrl.wrappers.single import check_limit as check_limit
-from delayrl.wrappers.single import name_of as name_of
-from delayrl.wrappers.single import seconds_of as seconds_of
+from delayrl.wrappers.layers import check_length
+from delayrl.wrappers.layers import check_limit as check_limit
+from delayrl.wrappers.layers import name_of as name_of
+from delayrl.wrappers.layers import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
 
 OPTIONS = ("env_kwargs", "wrappers", "flatten", "normalise", "rescale", "history", "fill")

@@ -18,7 +18,7 @@ from delayrl.training.machine import free_memory, uses_accelerator
 from delayrl.training.state import Ways
 from delayrl.training.tracking import SERVICES
 from delayrl.wrappers import Delayed
-from delayrl.wrappers.single import check_limit, name_of
+from delayrl.wrappers.layers import check_limit, name_of
 
 
 def check_ways(ways: Ways) -> None:

@@ -1,8 +1,9 @@
 """Gymnasium wrappers for late observations, actions and rewards, and for noise. They need NumPy and Gymnasium alone."""
 
 from delayrl.wrappers.augmented import AugmentedObservation, AugmentedVectorObservation
+from delayrl.wrappers.layers import check_spaces
 from delayrl.wrappers.noise import NoisyActions
-from delayrl.wrappers.single import Delayed, check_spaces
+from delayrl.wrappers.single import Delayed
 from delayrl.wrappers.vector import DelayedVector
 
 __all__ = [

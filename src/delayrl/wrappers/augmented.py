@@ -7,6 +7,7 @@ as it is.
 """
 
 from functools import partial
+from itertools import takewhile
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 
 from delayrl.delays import Delay
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Info, check_spaces, find_delayed, name_of
+from delayrl.wrappers.layers import check_spaces, layers_of, name_of
+from delayrl.wrappers.single import Info, find_delayed
 from delayrl.wrappers.vector import DelayedVector
 
 
@@ -74,16 +76,15 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
     """
 
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]]) -> None:
-        delayed, inner = find_delayed(env), env
+        delayed = find_delayed(env)
         if delayed is None:
             raise DelayRLError("AugmentedObservation goes around Delayed: wrap the task in Delayed first")
-        while inner is not delayed:
-            if isinstance(inner, AugmentedObservation):
+        for layer in takewhile(lambda layer: layer is not delayed, layers_of(env)):
+            if isinstance(layer, AugmentedObservation):
                 raise DelayRLError("the observations are augmented already: use one AugmentedObservation")
-            if isinstance(inner, TimeLimit) and delayed.delay.reward.maximum:
+            if isinstance(layer, TimeLimit) and delayed.delay.reward.maximum:
                 line = "TimeLimit around Delayed loses the rewards and the termination on their way"
                 raise DelayRLError(f"{line}: put TimeLimit inside Delayed, Delayed(TimeLimit(task, 100), delay)")
-            inner = inner.env  # type: ignore[attr-defined]
         check_spaces(name_of(env), env.observation_space, delayed.action_space)
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)

@@ -9,7 +9,8 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Info, check_spaces, find_delayed, name_of
+from delayrl.wrappers.layers import check_spaces, name_of
+from delayrl.wrappers.single import Info, find_delayed
 
 
 class NoisyActions(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]], RecordConstructorArgs):

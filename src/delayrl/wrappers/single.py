@@ -1,91 +1,26 @@
 """The wrapper that delays one environment."""
 
-import warnings
-from collections.abc import Iterator
 from typing import Any, SupportsFloat, get_args
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import Autoreset, DelayObservation, TimeLimit
+from gymnasium.wrappers import Autoreset, DelayObservation
 from numpy.typing import NDArray
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.delays.laws import whole_steps
-from delayrl.errors import DelayRLError, DelayWarning
+from delayrl.errors import DelayRLError
+from delayrl.wrappers.layers import check_length, check_spaces, layers_of, limit_of, name_of, seconds_of, warn_once
 from delayrl.wrappers.transit import Fill, Transit
 
 Info = dict[str, Any]
-_warned: set[str] = set()  # training makes the same task many times
-
-
-def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
-    """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
-    if not isinstance(observations, Box) or len(observations.shape) != 1:
-        got = " ".join(str(observations).split())[:200]
-        hint = "flatten=True (--flatten) turns a Dict or an image into one"
-        raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}: {hint}")
-    if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
-        raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
-    if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
-        raise DelayRLError(f"{name}: actions must be bounded, with low < high; got {actions}")
-
-
-def name_of(env: Any) -> str:
-    """Return the id of an environment, or the name of its class if it has none."""
-    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
-
-
-def seconds_of(env: Any) -> float | None:
-    """Return the length of a step in seconds: the `dt` of the outermost layer that has one, or the task's `tau`."""
-    layers = list(layers_of(env))
-    for seconds in [*(getattr(layer, "dt", None) for layer in layers), getattr(layers[-1], "tau", None)]:
-        if isinstance(seconds, int | float | np.number) and seconds > 0:
-            return float(seconds)
-    return None
-
-
-def layers_of(env: Any) -> Iterator[Any]:
-    """Yield an environment, and what it wraps, layer by layer."""
-    yield env
-    while isinstance(env, gym.Wrapper):
-        env = env.env
-        yield env
 
 
 def find_delayed(env: Any) -> "Delayed | None":
     """Return the `Delayed` that an environment is or wraps, if any."""
     return next((layer for layer in layers_of(env) if isinstance(layer, Delayed)), None)
-
-
-def limit_of(env: Any) -> int | None:
-    """Return the time limit of an environment in steps, from its spec or a `TimeLimit` around it; None without one."""
-    if env.spec is not None and env.spec.max_episode_steps is not None:
-        return int(env.spec.max_episode_steps)
-    limits = (layer._max_episode_steps for layer in layers_of(env) if isinstance(layer, TimeLimit))
-    return next(limits, None)  # of an environment that was not made by an id, and has no spec
-
-
-def check_limit(env: Any, name: str) -> None:
-    """Raise DelayRLError if an environment has no time limit: nobody could wait for the end of its episodes."""
-    if limit_of(env) is None:
-        hint = "add the wrapper 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)', or write it behind a | "
-        raise DelayRLError(f"{name} has no time limit, so an episode may never end; {hint}in the task")
-
-
-def check_length(delay: Delay, name: str, limit: int | None) -> None:
-    """Raise DelayRLError if a delay is longer than an episode of this task, whose time limit may be unknown."""
-    longest = max(delay.maximum, delay.reward.maximum)
-    if limit is not None and longest > limit:
-        raise DelayRLError(f"a delay of {longest} steps is longer than an episode of {name} ({limit} steps)")
-
-
-def warn_once(line: str) -> None:
-    """Warn of the task that a user makes. Training makes the same task many times."""
-    if line not in _warned:
-        _warned.add(line)
-        warnings.warn(line, DelayWarning, stacklevel=4)
 
 
 def check_layers(env: Any) -> None:

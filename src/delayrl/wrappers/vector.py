@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from delayrl.delays import DelayLike, as_delay
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.single import Info, check_spaces, find_delayed, history_rows, make_transit, name_of, seconds_of
+from delayrl.wrappers.layers import check_spaces, name_of, seconds_of
+from delayrl.wrappers.single import Info, find_delayed, history_rows, make_transit
 from delayrl.wrappers.transit import Fill, Transit
 
 OURS = ("age", "actions", "mask", "truth", "observation_age", "applied")  # what this wrapper adds to `info`
