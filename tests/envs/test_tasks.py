@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 
 import delayrl
-from delayrl import envs
 from delayrl.delays import as_delay
 from delayrl.envs import making
 
@@ -27,20 +26,20 @@ def test_a_task_is_made_only_for_the_length_of_its_steps(monkeypatch: pytest.Mon
     gym_make = making.gym.make
     monkeypatch.setattr(making.gym, "make", make)
     for delay in (5, "uniform:1:5", as_delay("walk:3"), "recorded:1,2,"):
-        assert envs.delay_of("Pendulum-v1", delay) == as_delay(delay)
+        assert making.delay_of("Pendulum-v1", delay) == as_delay(delay)
     assert not made
-    assert envs.delay_of("Pendulum-v1", "uniform:60ms:0.1s+action=40ms") == as_delay("uniform:2:2+action=1")
+    assert making.delay_of("Pendulum-v1", "uniform:60ms:0.1s+action=40ms") == as_delay("uniform:2:2+action=1")
     assert made == ["Pendulum-v1"]
     with pytest.raises(delayrl.DelayRLError, match="did you mean Pendulum-v1"):
-        envs.delay_of("Pendulm-v1", "80ms")
+        making.delay_of("Pendulm-v1", "80ms")
 
 
 @pytest.mark.parametrize("delay", [201, "walk:201", "2+reward=201", "151+action=50"])
 def test_no_delay_is_longer_than_an_episode(delay: int | str) -> None:
     """Rewards too, which training moves to no environment."""
     with pytest.raises(delayrl.DelayRLError, match="201 steps is longer than an episode of Pendulum-v1"):
-        envs.delay_of("Pendulum-v1", delay)
-    envs.delay_of("delayrl/unknown-v0", delay)  # whoever makes it says so
+        making.delay_of("Pendulum-v1", delay)
+    making.delay_of("delayrl/unknown-v0", delay)  # whoever makes it says so
 
 
 @pytest.mark.parametrize(

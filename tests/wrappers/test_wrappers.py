@@ -149,7 +149,7 @@ def test_images_and_unbounded_actions() -> None:
 
 def test_an_episode_in_which_nothing_is_observed(monkeypatch) -> None:
     """A delay as long as the episode, as the paper's Reacher at 50 steps: s_0 is shown to the end, ever older."""
-    monkeypatch.setattr("delayrl.wrappers.single._warned", set())
+    monkeypatch.setattr("delayrl.wrappers.layers._warned", set())
     with pytest.warns(DelayWarning, match=r"of 50 steps nothing after the start .* Reacher-v5 \(50 steps\)"):
         env = delayrl.make("Reacher-v5", 50)
     observations, infos, actions = rollout(env, 60)
