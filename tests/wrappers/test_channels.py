@@ -267,6 +267,26 @@ def test_vector_is_many_singles(mode: str, delay: str) -> None:
     assert ends > 5
 
 
+def test_vector_has_the_options_of_a_single() -> None:
+    """A longer history, zeros before anything arrives, another idle action, and steps of another length."""
+    options: dict[str, Any] = {"history": 6, "fill": "zeros", "idle": np.float32([0.5]), "step_seconds": 0.1}
+    delay = "0.2s+action=0.1s"
+    env = DelayedVector(vector(None, "Pendulum-v1"), delay, **options)
+    singles = [Delayed(gym.make("Pendulum-v1"), delay, **options) for _ in range(3)]
+    (obs, infos), now = env.reset(seed=5), [single.reset(seed=5 + i) for i, single in enumerate(singles)]
+    assert not obs.any()
+    assert env.delay == as_delay("2+action=1")
+    for step in range(8):
+        for i, (x, info) in enumerate(now):
+            np.testing.assert_array_equal(obs[i], x)
+            for name in ("age", "actions", "mask", "truth", "observation_age", "applied"):
+                np.testing.assert_array_equal(infos[name][i], info[name])
+        actions = np.full((3, 1), 0.1 * step, np.float32)
+        obs, *_, infos = env.step(actions)
+        now = [(x, info) for x, *_, info in (single.step(a) for single, a in zip(singles, actions, strict=True))]
+    assert infos["actions"].shape == (3, 6, 1)
+
+
 def test_vector_streams_and_refusals() -> None:
     env = DelayedVector(vector(None, "Pendulum-v1", 4), "uniform:0:5")
     env.reset(seed=1)
