@@ -339,7 +339,7 @@ def main() -> None:
         arms, goals = ladder.sections(rows, images / "ladder.png")
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
         insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
-    rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "any-age-ladder")]
+    rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)

@@ -1,4 +1,4 @@
-"""The result on the first page: what each method is worth, from the cells of `evidence-1` that have ended."""
+"""The result on the first page: what each method is worth, from the cells of `evidence-1` and `evidence-2` that have ended."""
 
 from pathlib import Path
 
@@ -21,6 +21,7 @@ Chosen = dict[tuple[str, Case], Result]
 CASES: tuple[Case, ...] = (
     ("HalfCheetah-v5", 5),
     ("HalfCheetah-v5", 25),
+    ("HalfCheetah-v5", 50),
     ("delayrl/Pusher-v4", 25),
     ("delayrl/Pusher-v4", 50),
 )
@@ -110,15 +111,17 @@ def cell(result: Result | None) -> str:
 
 def draw(chosen: Chosen, out: Path) -> None:
     """Draw a panel of curves for each case."""
-    figure, panels = pyplot.subplots(2, 2, figsize=(10, 7), layout="constrained")
+    figure, panels = pyplot.subplots(2, 3, figsize=(12, 6.6), layout="constrained")
+    *panels, beside = panels.flat
     lines = {}
-    for axes, case in zip(panels.flat, CASES, strict=True):
+    for axes, case in zip(panels, CASES, strict=True):
         for label, colour in COLOURS.items():
             if (label, case) in chosen:
                 lines[label] = curve(axes, *chosen[label, case].curves, colour)
         axes.set_title(f"{short(case[0])}, {case[1]} steps late")
     labels = [label for label in COLOURS if label in lines]
     names = [label.replace("`", "") for label in labels]
-    figure.legend([lines[label] for label in labels], names, loc="outside lower center", ncols=5, frameon=False)
+    beside.axis("off")
+    beside.legend([lines[label] for label in labels], names, loc="center left", frameon=False)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)
