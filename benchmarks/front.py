@@ -111,7 +111,7 @@ def cell(result: Result | None) -> str:
 
 def draw(chosen: Chosen, out: Path) -> None:
     """Draw a panel of curves for each case."""
-    figure, panels = pyplot.subplots(2, 3, figsize=(12, 6.6), layout="constrained")
+    figure, panels = pyplot.subplots(2, 3, figsize=(10, 6.2), layout="constrained")
     *panels, beside = panels.flat
     lines = {}
     for axes, case in zip(panels, CASES, strict=True):
@@ -119,6 +119,7 @@ def draw(chosen: Chosen, out: Path) -> None:
             if (label, case) in chosen:
                 lines[label] = curve(axes, *chosen[label, case].curves, colour)
         axes.set_title(f"{short(case[0])}, {case[1]} steps late")
+        axes.locator_params(axis="x", nbins=4)
     labels = [label for label in COLOURS if label in lines]
     names = [label.replace("`", "") for label in labels]
     beside.axis("off")
