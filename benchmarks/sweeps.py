@@ -51,3 +51,16 @@ def table(seeds: NDArray[np.float64]) -> str:
     shown = sorted({*range(0, len(means), SHOWN), len(means) - 1, int(means.argmin()), int(means.argmax())})
     rows = [[str(d), f"{means[d]:,.0f} ± {deviations[d]:,.0f}", f"{means[d] / means.max():.2f}"] for d in shown]
     return markdown_table(["Δ in evaluation", "mean return", "part of the best"], rows)
+
+
+def section(file: Path, agent: str) -> str:
+    """Return the table of one agent's rows, with what made them."""
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    config = next(line["config"] for line in lines if "config" in line)
+    episodes = next(line["sweep"]["episodes"] for line in lines if "sweep" in line)
+    versions, seeds = config["versions"], read(file)[agent]
+    made = f"{config['env']}, trained under {config['delay']}, preset `{config['preset']}`, "
+    made += f"{config['schedule']['steps']:,} steps, {len(seeds)} seeds, {episodes} episodes each on start states that the run "
+    made += f"never saw; ± is the standard deviation over seeds. {versions['cores']} x86 cores, jax {versions['jax']}, "
+    made += f"MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: `benchmarks/results/{file.name}`."
+    return f"{table(seeds)}\n\n{made}"
