@@ -59,8 +59,11 @@ def section(file: Path, agent: str) -> str:
     config = next(line["config"] for line in lines if "config" in line)
     episodes = next(line["sweep"]["episodes"] for line in lines if "sweep" in line)
     versions, seeds = config["versions"], read(file)[agent]
-    made = f"{config['env']}, trained under {config['delay']}, preset `{config['preset']}`, "
-    made += f"{config['schedule']['steps']:,} steps, {len(seeds)} seeds, {episodes} episodes each on start states that the run "
-    made += f"never saw; ± is the standard deviation over seeds. {versions['cores']} x86 cores, jax {versions['jax']}, "
-    made += f"MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: `benchmarks/results/{file.name}`."
+    steps = f"{config['schedule']['steps']:,} steps, {len(seeds)} seeds, {episodes} episodes each"
+    made = (
+        f"{config['env']}, trained under {config['delay']}, preset `{config['preset']}`, {steps} on start states that "
+    )
+    made += "the run never saw; ± is the standard deviation over seeds. "
+    made += f"{versions['cores']} x86 cores, jax {versions['jax']}, MuJoCo {versions['mujoco']}, "
+    made += f"commit {versions['commit']}. Rows: `benchmarks/results/{file.name}`."
     return f"{table(seeds)}\n\n{made}"
