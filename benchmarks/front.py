@@ -1,4 +1,4 @@
-"""The result on the first page: what each method is worth, from the cells of `evidence-1` and `evidence-2` that have ended."""
+"""The result on the first page: what each method is worth, from the cells of `evidence-1` and `-2` that have ended."""
 
 from pathlib import Path
 
