@@ -17,6 +17,7 @@ from delayrl.bench import folders
 from delayrl.bench.backends.slurm import script, submit
 from delayrl.bench.grid import load_grid
 from delayrl.cli.main import main
+from delayrl.run.cell import Progress
 
 NODE = Path(__file__).with_name("slurm_node.sh")
 PROGRAMS = ("slurmctld", "slurmd", "munged")
@@ -53,7 +54,7 @@ def test_written_for_another_machine(tmp_path: Path, capsys, monkeypatch) -> Non
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(delayrl.DelayRLError, match="there is no sbatch here"):
         submit(path)
-    monkeypatch.setattr("delayrl.cli.bench.status", lambda *_: "done")
+    monkeypatch.setattr("delayrl.cli.bench.progress", lambda *_: Progress("done", 0, None))
     main(words)
     assert "all 2 cells are done" in capsys.readouterr().out
 
