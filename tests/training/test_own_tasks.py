@@ -88,6 +88,15 @@ def test_environments_are_closed(tmp_path: Path) -> None:
     evaluate(run, 2, env=held)
     delayrl.load(run, held)
     assert not open_now
+
+    def two_at_most() -> gym.Env:
+        if len(open_now) == 2:
+            raise RuntimeError("no third")
+        return held()
+
+    with pytest.raises(DelayRLError, match="RuntimeError: no third"):
+        train("bpql", tmp_path / "three", env=two_at_most, seeds=3)
+    assert not open_now
     other = train("random", tmp_path / "other", env="Pendulum-v1", steps=200)
     with pytest.raises(DelayRLError, match="the policy takes observations of size 3"):
         evaluate(other.policy(), 2, env=held)

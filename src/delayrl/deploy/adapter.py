@@ -31,6 +31,7 @@ from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import described, pack
 from delayrl.errors import DelayRLError
+from delayrl.run.arrays import inner_range
 from delayrl.wrappers import AugmentedObservation, Delayed
 from delayrl.wrappers.layers import layers_of, name_of
 from delayrl.wrappers.single import find_delayed
@@ -97,8 +98,7 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         function if augmented is None else of_vector,
         delayed.observation_space.shape[0],  # type: ignore[index]  # Delayed has checked that it is flat
         actions.shape[0],
-        actions.low,
-        actions.high,
+        *inner_range(actions.low, actions.high),
         history,
         delayed.step_seconds,
         delay.action.maximum,

@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from delayrl.envs.making import name_of
 from delayrl.envs.task import TaskLike, as_task
 from delayrl.errors import DelayRLError, described
 from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push
@@ -96,7 +97,7 @@ def probe(
 
 
 def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Iterable[int]], Iterable[int]]) -> Probed:
-    name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+    name = name_of(env)
     if not isinstance(env.action_space, Box) or not np.issubdtype(env.action_space.dtype, np.floating):
         raise DelayRLError(f"{name}: only real-valued Box actions can be probed; got {env.action_space}")
     scale, delay = _scout(env, name, seed, longest)

@@ -53,13 +53,14 @@ class Evaluator:
         served = servable(env, delay, spec)
         self._delay, self._apply = spec.delay, apply
         self._act = _compiled_act(agent)
-        self._envs = [[make(env, served, rescale=True) for _ in range(episodes)] for _ in range(seeds)]
-        try:
+        with contextlib.ExitStack() as held:
+            self._envs = [
+                [held.enter_context(stepping.closing(make(env, served, rescale=True))) for _ in range(episodes)]
+                for _ in range(seeds)
+            ]
             check_fits(self._envs[0][0], spec)
             check_limit(self._envs[0][0], str(as_task(env)))
-        except DelayRLError:
-            self.close()
-            raise
+            self._held = held.pop_all()  # now that nothing is refused any more
 
     def __call__(
         self,
@@ -106,7 +107,7 @@ class Evaluator:
 
     def close(self) -> None:
         """Close the environments."""
-        stepping.close(*itertools.chain(*self._envs))
+        self._held.close()
 
     def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
         return stepping.step(self._envs[at[0]][at[1]], action)

@@ -16,8 +16,9 @@ from delayrl.delays import Delay, stored_delay
 from delayrl.envs.making import make
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError
+from delayrl.play import stepping
 from delayrl.run.agents import AgentLike, agent_of
-from delayrl.run.arrays import restore_tree
+from delayrl.run.arrays import inner_range, restore_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder, RunLike, path_of
 
@@ -29,7 +30,7 @@ class Policy:
         agent: its hyperparameters.
         state: its weights, a tree of arrays.
         spec: sizes of the task, and the longest age it was trained for.
-        low, high: the range of its actions, [A], float32: no number of it is beyond the task's own.
+        low, high: the range of its actions, [A], in single precision, rounded inwards.
         step: how many environment steps it has learned from; None if unknown.
     """
 
@@ -44,9 +45,7 @@ class Policy:
         step: int | None = None,
     ) -> None:
         self.agent, self.state, self.spec, self.step = agent, state, spec, step
-        below, above = np.asarray(low, np.float32), np.asarray(high, np.float32)
-        self.low = np.where(below < low, np.nextafter(below, np.float32(np.inf)), below)
-        self.high = np.where(above > high, np.nextafter(above, np.float32(-np.inf)), above)
+        self.low, self.high = inner_range(low, high)
         self._key = jax.random.key(seed)
         self._act = jax.jit(lambda state, seen, key: agent.act(state, seen, key, explore=False))
 
@@ -125,9 +124,8 @@ def restored(
 ) -> Policy:
     """Load the policy in a checkpoint of a run with this configuration, whose task is looked up; `given` as `load`."""
     agent = agent_of(config, run.path, given)
-    env = make(task, trained_delay(run.path))
-    spec = spec_of(env)
-    env.close()
+    with stepping.closing(make(task, trained_delay(run.path))) as env:
+        spec, actions = spec_of(env), env.action_space
     try:
         state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
     except DelayRLError as error:
@@ -135,7 +133,6 @@ def restored(
         if not instead:
             raise
         raise DelayRLError(f"the run does not fit the {' and the '.join(instead)} given: {error}") from error
-    actions: Any = env.action_space
     return Policy(agent, state, spec, actions.low, actions.high, step=checkpoint.step)
 
 

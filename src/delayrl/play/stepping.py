@@ -1,7 +1,8 @@
 """Reset and step environments whose code is the user's: what it raises becomes one line that says where."""
 
-import contextlib
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,13 @@ def step(env: Any, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]
         raise DelayRLError(f"{name_of(env)} gave {given}: they must be a number and two truth values") from None
 
 
-def close(*envs: Any) -> None:
-    """Close environments. What they raise changes no result, and is left aside."""
-    for env in envs:
-        with contextlib.suppress(Exception):
+@contextmanager
+def closing(env: Any) -> Iterator[Any]:
+    """Yield an environment, and close it at the end. What its `close` raises changes no result, and is left aside."""
+    try:
+        yield env
+    finally:
+        with suppress(Exception):
             env.close()
 
 

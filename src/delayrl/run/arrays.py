@@ -34,6 +34,13 @@ def load_arrays(path: Path) -> Arrays:
     return arrays  # type: ignore[no-any-return]
 
 
+def inner_range(low: NDArray[Any], high: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return a range in single precision, rounded inwards: no number of it is beyond the given one."""
+    least, largest = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    least = np.where(least < low, np.nextafter(least, np.float32(np.inf)), least)
+    return least, np.where(largest > high, np.nextafter(largest, np.float32(-np.inf)), largest)
+
+
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves of a pytree by name, in its order: "critic.0.w" for `tree.critic[0]["w"]`."""
     import jax

@@ -1,4 +1,4 @@
-"""What is refused before anything is stored or deleted."""
+"""What is refused before anything is stored or deleted, and what a new run is warned of."""
 
 import warnings
 from importlib.util import find_spec
@@ -73,9 +73,8 @@ def check_fit(setup: Setup, env: Delayed) -> State:
 
 def check_repeats(setup: Setup) -> None:
     """Warn if an environment does not begin twice in the same way from one seed. It is made for that, and closed."""
-    env = make(setup.task, setup.delay.observed(), rescale=True)
-    first, again = (stepping.reset(env, 0)[1]["truth"] for _ in range(2))
-    stepping.close(env)
+    with stepping.closing(make(setup.task, setup.delay.observed(), rescale=True)) as env:
+        first, again = (stepping.reset(env, 0)[1]["truth"] for _ in range(2))
     if not np.array_equal(first, again):
         why = "its reset has to call super().reset(seed=seed), and its wrappers to keep nothing over a reset"
         line = f"{name_of(env)} does not begin an episode twice in the same way from one seed ({why})"

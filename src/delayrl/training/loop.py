@@ -123,9 +123,8 @@ class Loop:
         if due and not self._learning:
             self._learning = True
             if not self._can_learn():  # the first block's own steps count too
-                raise DelayRLError(
-                    f"no episode of {group.setup.condition.env} is long enough to learn from under this protocol"
-                )
+                task = group.setup.condition.env
+                raise DelayRLError(f"no episode of {task} is long enough to learn from under this protocol")
 
     def _act(self) -> Any:
         group, state = self.group, self.state

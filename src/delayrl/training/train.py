@@ -126,8 +126,8 @@ def train_group(
     """Train seeds in lockstep, each in its folder, from where it stands; `given` is the delay as the user wrote it."""
     check_ways(ways)
     with ExitStack() as held:
-        envs = [make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers]
-        held.callback(stepping.close, *envs)
+        made = (make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers)
+        envs = [held.enter_context(stepping.closing(env)) for env in made]
         spec = spec_of(envs[0])
         shapes = check_fit(setup, envs[0])  # before anything is stored
         check_memory(setup, spec, len(numbers), ways.device)
@@ -148,7 +148,7 @@ def train_group(
         group = Group(setup, numbers, folders, keys, spec, shapes, program, ways, apply, source, further)
 
         def note(line: str) -> None:
-            if ways.progress and line:
+            if ways.progress:
                 tqdm.write(line, file=sys.stderr)
 
         if given is not None and not setup.delay.maximum:
@@ -158,5 +158,6 @@ def train_group(
         state = start(group, actors, overwrite, note)
         if state.step == 0:
             check_repeats(setup)
-            note(shared(len(numbers), ways.device))
+            if line := shared(len(numbers), ways.device):
+                note(line)
         run(group, state, note, stop.is_set)

@@ -119,10 +119,10 @@ class Controller:
         capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
         self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
         self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
-        first = policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, policy.action_size), np.float32), 0)
-        if np.shape(first) != (policy.action_size,):
-            size = policy.action_size
-            raise DelayRLError(f"the policy's action must be {size} numbers; got shape {np.shape(first)}")
+        size = policy.action_size
+        shape = np.shape(policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, size), np.float32), 0))
+        if shape != (size,):
+            raise DelayRLError(f"the policy's action must be {size} numbers; got shape {shape}")
 
     @property
     def serves(self) -> str:
