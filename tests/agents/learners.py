@@ -31,9 +31,9 @@ def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=N
     return learner, metrics, keys
 
 
-def counted(delay: int, steps: int, batch: int, ahead: int):
-    """Random play of the counter, and windows of it."""
-    transitions, _ = record("delayrl/Counter-v0", delay, steps)
+def counted(delay: int, steps: int, batch: int, ahead: int, law: str | None = None):
+    """Random play of the counter, under a random delay if there is a law, and windows of it."""
+    transitions, _ = record("delayrl/Counter-v0", law or delay, steps)
     replay = ring.init(Spec(2, 1, delay), 2 * steps)
     for transition in transitions:
         replay = jax.jit(ring.append)(replay, transition)

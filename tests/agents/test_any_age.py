@@ -1,4 +1,4 @@
-"""Any-age: younger views of the same moment, the annealed pull, and BPQL or SAC where there is nothing to add."""
+"""Any-age: other views of the same moment, the annealed pull, and BPQL or SAC where there is nothing to add."""
 
 from dataclasses import replace
 
@@ -35,12 +35,17 @@ def test_without_a_delay_it_is_sac() -> None:
     assert same(trained(AGENT, 0)[0].agent, trained(replace(AGENT.bpql, actor_sees="current"), 0)[0].agent)
 
 
-def test_younger_views() -> None:
-    """On the counter: (s_{t-j}, the j actions since, j / Δ), each j from 0 to the shown age equally often."""
-    transitions, windows = counted(4, 300, batch=4000, ahead=1)
+@pytest.mark.parametrize(("law", "pull"), [(None, 0.0), ("uniform:1:4", 0.0), ("uniform:1:4", 1.0)])
+def test_second_views(law: str | None, pull: float) -> None:
+    """On the counter: (s_{t-j}, the j actions since, j / Δ), each j that the episode reaches equally often.
+
+    With a pull, each j from 0 to the shown age.
+    """
+    agent = replace(AGENT, pull_weight=pull)
+    transitions, windows = counted(4, 300, batch=4000, ahead=1, law=law)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
-    x = np.asarray(AGENT.younger(windows, jax.random.key(1)))
-    fresh = np.asarray(replace(AGENT, second_age="zero").younger(windows, jax.random.key(1)))
+    x = np.asarray(agent.second_view(windows, jax.random.key(1)))
+    fresh = np.asarray(replace(agent, second_age="zero").second_view(windows, jax.random.key(1)))
     ages: dict[int, list[int]] = {}
     for i, action in enumerate(np.asarray(windows.action[:, 4, 0]).tolist()):
         step = by_action[action]
@@ -49,22 +54,23 @@ def test_younger_views() -> None:
         since = [transitions[step - j + k].action[0] if k < j else 0 for k in range(4)]
         np.testing.assert_allclose(x[i], [now - j, length, *since, j / 4], rtol=1e-6)
         np.testing.assert_allclose(fresh[i], [now, length, 0, 0, 0, 0, 0])
-        ages.setdefault(int(windows.age[i, 4]), []).append(j)
+        ages.setdefault(int(windows.age[i, 4] if pull else min(now, 4)), []).append(j)
+    assert set(ages) == {0, 1, 2, 3, 4}
     for age, drawn in ages.items():
         counts = np.bincount(drawn, minlength=age + 1)
-        assert len(counts) == age + 1  # none older than what was shown
+        assert len(counts) == age + 1  # none older
         expected = len(drawn) / (age + 1)
         assert ((counts - expected) ** 2 / expected).sum() < age + 6 * np.sqrt(2 * max(age, 1))
 
 
 def test_ages_in_turn_without_a_pull(rng: np.random.Generator) -> None:
-    """One view of each sample, half of them younger; a pull compares both views of each."""
-    own, younger = jnp.asarray(rng.normal(size=(2, 6, 4)))
-    mixed = replace(AGENT, pull_weight=0.0).views(own, younger)
+    """One view of each sample, half of them at the second age; a pull compares both views of each."""
+    own, second = jnp.asarray(rng.normal(size=(2, 6, 4)))
+    mixed = replace(AGENT, pull_weight=0.0).views(own, second)
     np.testing.assert_array_equal(mixed[0, ::2], own[::2])
-    np.testing.assert_array_equal(mixed[0, 1::2], younger[1::2])
+    np.testing.assert_array_equal(mixed[0, 1::2], second[1::2])
     assert len(mixed) == 1
-    np.testing.assert_array_equal(AGENT.views(own, younger), jnp.stack([own, younger]))
+    np.testing.assert_array_equal(AGENT.views(own, second), jnp.stack([own, second]))
     np.testing.assert_array_equal(AGENT.views(own, None), own[None])
 
 
@@ -79,7 +85,7 @@ def test_actor_gradient_by_hand(distance: str) -> None:
     windows = ring.sample(replay, jax.random.key(0), 16, 3, 1, jnp.int32(0))
     state = AGENT.init(Spec(OBS, ACT, 3), jax.random.key(0))
     older, critic_input = AGENT.bpql._inputs(windows, 0)
-    younger = AGENT.younger(windows, jax.random.key(2))
+    younger = AGENT.second_view(windows, jax.random.key(2))
     assert not np.allclose(older, younger)
     moved = agent.improve_actor(windows, younger, jnp.float32(3.0), state, older, critic_input, jax.random.key(5))
     frozen = AGENT.bpql.policy(state.actor, younger)
@@ -209,10 +215,10 @@ def test_a_forecast_is_learned_in_an_update(pulled: bool) -> None:
     state = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
     windows = random_windows(Spec(OBS, ACT, 3))
     older, now = FORECASTING.bpql._inputs(windows, 0)
-    younger = FORECASTING.younger(windows, jax.random.key(2))
-    in_turn = jnp.where(jnp.arange(len(older))[:, None] % 2 == 0, older, younger)
-    for second, views in ((younger, [older, younger] if pulled else [in_turn]), (None, [older])):
-        moved = agent.improve_actor(windows, second, jnp.float32(0.0), state, older, now, jax.random.key(5))
+    second = FORECASTING.second_view(windows, jax.random.key(2))
+    in_turn = jnp.where(jnp.arange(len(older))[:, None] % 2 == 0, older, second)
+    for other, views in ((second, [older, second] if pulled else [in_turn]), (None, [older])):
+        moved = agent.improve_actor(windows, other, jnp.float32(0.0), state, older, now, jax.random.key(5))
         gradients = [jax.grad(forecast_loss)(state.actor, x, now)["forecast"] for x in views]
         mean = moved.actor_opt_state[0].mu["forecast"]
         expected = jax.tree.map(lambda *g: sum(g) / len(g), *gradients)
@@ -226,7 +232,7 @@ def test_belief_by_hand() -> None:
     _, windows = counted(4, 300, batch=500, ahead=1)
     spec = Spec(2, 1, 4)
     state = SEQUENTIAL.init(spec, jax.random.key(0))
-    x = SEQUENTIAL.younger(windows, jax.random.key(0))  # any inputs of the right shape
+    x = SEQUENTIAL.second_view(windows, jax.random.key(0))  # any inputs of the right shape
     silent = state.actor | {"belief": jax.tree.map(jnp.zeros_like, state.actor["belief"])}
     ages = np.asarray(windows.age[:, 4])
     changes = np.array([i for age in ages for i in range(1, age + 1)])

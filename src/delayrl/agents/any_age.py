@@ -1,11 +1,11 @@
 """Any-age: BPQL whose actor acts on a forecast of the current state, one network for every age.
 
 Idea: BPQL's critic values actions in the true state s_t, whatever view chose them. A forecast of s_t from x_t learns
-from the states alone, and the policy acts on it. For one and the same s_t the replay holds every younger view too:
-x^(j)_t = (s_{t-j}, a_{t-j}, …, a_{t-1}), j = 0..d. So half of each batch is seen at a random younger age, and the same
-critic teaches every age. π(x^(d)_t) may be pulled towards π(x^(j)_t), with a weight that is annealed to nothing.
+from the states alone, and the policy acts on it. For one and the same s_t the replay holds the view of every age:
+x^(j)_t = (s_{t-j}, a_{t-j}, …, a_{t-1}), j = 0..Δ. So half of each batch is seen at a random age, and the same critic
+teaches every age. π(x^(d)_t) may be pulled towards a younger π(x^(j)_t), with a weight that is annealed to nothing.
 
-Views: the actor sees a forecast from x_t, at its own and at a younger age; the critics see s_t. Unprivileged: s_t and
+Views: the actor sees a forecast from x_t, at its own and at a second age; the critics see s_t. Unprivileged: s_t and
 the observations in between are learned from once they have arrived.
 
 What it takes from whom stands in docs/algorithms/any-age.md.
@@ -45,9 +45,7 @@ class AnyAge:
     bpql: sac.SAC = field(
         default_factory=lambda: sac.SAC(actor_sees="augmented", entropy_unit="scaled", critic_norm="layer")
     )
-    second_age: Annotated[SecondAge, "the younger age that the actor learns at too: none, random in 0..d, or 0"] = (
-        "random"
-    )
+    second_age: Annotated[SecondAge, "the age that the actor learns at too: none, random in 0..Δ, or 0"] = "random"
     pull: Annotated[Pull, "distance of the pull: of both policies' moments, or KL(older‖younger)"] = "moments"
     pull_weight: Annotated[float, "initial weight of a pull towards the younger age; 0: none", (0.0, 1e6)] = 0.0
     pull_hold: Annotated[float, "part of the run in which the pull's weight stays constant", (0.0, 1.0)] = 0.25
@@ -112,27 +110,31 @@ class AnyAge:
         return replace(self.bpql, actor_network=encoded)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
-        """Update the critics as BPQL does, and the actor at its own and a younger age."""
+        """Update the critics as BPQL does, and the actor at its own and a second age."""
         if (self.second_age == "none" and self.encoder != "forecast") or windows.delay == 0:
             return self.learner.update(state, windows, key, count)
         age_key, update_key = jax.random.split(key)
         weight = self.weight(self.phases()[0].step_of(count))
-        younger = None if self.second_age == "none" else self.younger(windows, age_key)
-        improve = functools.partial(self.improve_actor, windows, younger, weight)
+        second = None if self.second_age == "none" else self.second_view(windows, age_key)
+        improve = functools.partial(self.improve_actor, windows, second, weight)
         state, metrics = self.learner.update(state, windows, update_key, count, improve)
         return state, metrics | ({"pull_weight": weight} if self.pull_weight else {})
 
-    def younger(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
-        """Return x^(j)_t of each window, j uniform on 0..d, or 0, as the actor sees it."""
-        age = windows.age[:, windows.delay]
-        share = jax.random.uniform(key, age.shape) if self.second_age == "random" else jnp.zeros(age.shape)
-        ages = jnp.floor(share * (age + 1)).astype(jnp.int32)
+    def second_view(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
+        """Return x^(j)_t of each window as the actor sees it, j uniform on 0..Δ, or 0.
+
+        No j reaches back behind the start of the episode; with a pull, which is towards the young, none exceeds d.
+        """
+        now = windows.delay
+        oldest = windows.age[:, now] if self.pull_weight else windows.valid[:, :now].sum(1)
+        share = jax.random.uniform(key, oldest.shape) if self.second_age == "random" else jnp.zeros(oldest.shape)
+        ages = jnp.floor(share * (oldest + 1)).astype(jnp.int32)
         return jax.vmap(lambda window, age: network_input(view(window, age=age), "augmented"))(windows, ages)
 
     def improve_actor(
         self,
         windows: Window,
-        younger: Array | None,
+        second: Array | None,
         weight: Array,
         state: State,
         actor_input: Array,
@@ -140,12 +142,12 @@ class AnyAge:
         key: Key,
     ) -> State:
         """Take one gradient step on the actor: as much for each age, the pull of the older one, its encoder's loss."""
-        x = self.views(actor_input, younger)
+        x = self.views(actor_input, second)
         states = jnp.stack([critic_input] * len(x))
 
         def penalty(actor: Params, policy: Gaussian) -> Array:
             total = jnp.zeros(())
-            if self.pull_weight and younger is not None:
+            if self.pull_weight and second is not None:
                 total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.encoder == "forecast":
                 total += forecast_loss(actor, x, states)
@@ -158,13 +160,13 @@ class AnyAge:
             state = state._replace(actor=follow_changes(state.actor, x, states))
         return state
 
-    def views(self, own: Float[Array, "batch input"], younger: Array | None) -> Float[Array, "ages batch input"]:
-        """Return what the actor learns at: each sample at its own age and the younger in turn; with a pull, at both."""
-        if younger is None:
+    def views(self, own: Float[Array, "batch input"], second: Array | None) -> Float[Array, "ages batch input"]:
+        """Return what the actor learns at: own and second ages in turn, or with a pull each sample at both."""
+        if second is None:
             return own[None]
         if self.pull_weight:
-            return jnp.stack([own, younger])
-        return jnp.where(jnp.arange(len(own))[:, None] % 2 == 0, own, younger)[None]
+            return jnp.stack([own, second])
+        return jnp.where(jnp.arange(len(own))[:, None] % 2 == 0, own, second)[None]
 
     def distance(self, older: Gaussian, younger: Gaussian) -> Float[Array, ""]:
         """Return how far the older policy is from the younger one, which is held fixed."""
