@@ -215,6 +215,8 @@ BAD = [
     ("product = []", "there are no products, so nothing to run"),
     (BASIC + "product = []", "there are no products, so nothing to run"),
     ('agent = ["bpql"]\n', "unknown key 'agent' of the grid"),
+    ('include = ["laptop"]\nseeds = 5\n', "seeds is for the grid's own products, and it has none"),
+    ('include = ["laptop"]\n[overrides]\nsteps = 9\n', "overrides is for the grid's own products"),
     (BASIC.replace("bpql", "bqpl"), "unknown agent 'bqpl'; did you mean bpql"),
     (BASIC.replace("Reacher-v5", "Reacher-v9"), "unknown task 'Reacher-v9'"),
     (BASIC.replace('["bpql", "a-sac"]', "[]"), "there are no agents, so nothing to run"),

@@ -90,11 +90,10 @@ def test_columns_of_other_versions_and_provenance(finished, tmp_path: Path) -> N
     cell = replace(grid.cells[0], id="0123")
     run = RunFolder(runs / cell.folder / "seed0")
     source = RunFolder(runs / grid.cells[0].folder / "seed0")
-    run.create({k: v for k, v in source.config.items() if k != "format"})
+    run.create(source.config | {"later_versions": [{"jax": "0.10", "device": "other"}]})
     rows = source.read("rows")
     for i, row in enumerate(rows):
         run.append("rows", [row | {"physics": "ab12", "mujoco": "3.2.7" if i else "3.5.0", "return": 0.1 + 1e-17 * i}])
-    folders.note(runs / cell.folder, "begun", versions={"jax": "0.10", "device": "other"})
     alone = Grid("alone", "", Path("alone.toml"), (cell,))
     collect(alone, runs, tmp_path / "t.sqlite")
     assert read_table(tmp_path / "t.sqlite")[0] == list(rows_of([cell], runs))

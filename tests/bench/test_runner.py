@@ -306,10 +306,10 @@ def test_journal_after_a_crash(tmp_path: Path) -> None:
     folders.note(tmp_path, "begun")
     with open(tmp_path / "journal.jsonl", "a") as file:
         file.write('{"event": "do')
-    folders.note(tmp_path, "begun", versions={"jax": "1"})
+    folders.note(tmp_path, "begun", step=5)
     folders.note(tmp_path, "done")
     assert [e["event"] for e in folders.journal(tmp_path)] == ["begun", "begun", "done"]
-    assert folders.journal(tmp_path)[1]["versions"] == {"jax": "1"}
+    assert folders.journal(tmp_path)[1]["step"] == 5
 
 
 def test_lock(tmp_path: Path) -> None:

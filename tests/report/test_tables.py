@@ -9,7 +9,7 @@ from synthetic import row, rows, small, standing
 from delayrl.bench.grid import load_grid
 from delayrl.report.markdown import markdown
 from delayrl.report.summary import summarise
-from delayrl.report.tables import published_values
+from delayrl.report.tables import TableEntry, published_values
 from delayrl.run.cell import Progress
 from delayrl.run.condition import resolve
 from delayrl.run.rows import CONFIGURATION
@@ -24,6 +24,19 @@ def test_columns_that_were_not_run_are_empty_beside_the_papers_value() -> None:
     assert math.isnan(entry.raw)
     assert entry.published == ("2", 0.96, 0.03)
     assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].published[:2] == ("1", 420_000)  # type: ignore[index]
+
+
+def test_rows_and_columns_without_a_number_are_left_out() -> None:
+    """The list of all results has them. A place beside numbers stays, empty."""
+    done = [standing("bpql", "Ant-v4", 5, preset="small"), standing("vdpo", "Ant-v4", 25, preset="small")]
+    late = [("dida", 5), ("bpql", 50)]
+    todo = [standing(agent, "Ant-v4", delay, preset="small", state="todo", step=0) for agent, delay in late]
+    summary = summarise(rows(done), [*done, *todo])
+    for table in summary.tables:
+        assert (table.rows, table.columns) == ([("Ant-v4", 5), ("Ant-v4", 25)], ["bpql", "vdpo"])
+        assert table.entries["Ant-v4", 25, "bpql"] == TableEntry()
+    assert "| Ant-v4 | 50 | bpql |" in markdown(summary, "", {})
+    assert not summarise([], todo).tables
 
 
 def test_ablation_meets_the_papers_columns() -> None:

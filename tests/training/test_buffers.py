@@ -68,8 +68,13 @@ def test_no_fresh_pages() -> None:
 
 
 @pytest.mark.thorough
-def test_no_result_changes(tmp_path: Path) -> None:
-    words = {"steps": 60, "evaluate_every": 30, "random_steps": 20, "evaluation_episodes": 1, "progress": False}
+@pytest.mark.parametrize("worker", [False, True])
+def test_no_result_changes(worker: bool, tmp_path: Path) -> None:
+    """Neither of `train` nor of a cell of a grid, whose worker must leave it to `train` to start JAX."""
+    words = {"steps": 60, "evaluate_every": 30, "random_steps": 20, "evaluation_episodes": 1}
+    condition = {"agent": "sac", "env": "Pendulum-v1", "delay": 0, "preset": "small", "protocol": "corrected"}
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "cell.json").write_text(json.dumps({**condition, "overrides": words, "seeds": [0]}))
     code = """
 import json, sys
 import delayrl.training.buffers, delayrl.training.train
@@ -80,14 +85,19 @@ def first(*args):
     assert not xla_bridge.backends_are_initialized()  # else JAX does not read the setting
     return keep(*args)
 delayrl.training.train.keep_buffers = first
-from delayrl import train
-train("sac", "Pendulum-v1", preset="small", out=sys.argv[1], **json.loads(sys.argv[2]))
+import delayrl.bench.worker, pathlib
+if sys.argv[3] == "True":
+    assert delayrl.bench.worker.work(pathlib.Path(sys.argv[1])).kind == "done"
+else:
+    delayrl.train("sac", "Pendulum-v1", preset="small", out=sys.argv[1], progress=False, **json.loads(sys.argv[2]))
 import jax
 print(jax.config.read("jax_cpu_enable_async_dispatch"))
 """
-    assert python(code, str(tmp_path / "kept"), json.dumps(words)) == str(not glibc())
-    train("sac", "Pendulum-v1", preset="small", out=tmp_path / "plain", **words)
+    out = tmp_path / ("cell" if worker else "kept")
+    assert python(code, str(out), json.dumps(words), str(worker)) == str(not glibc())
+    train("sac", "Pendulum-v1", preset="small", out=tmp_path / "plain", progress=False, **words)
+    kept = out / "seed0" if worker else out
     for pattern in ("rows.jsonl", "checkpoints/*/agent.safetensors"):
-        found = (sorted((tmp_path / name).glob(pattern)) for name in ("kept", "plain"))
+        found = (sorted(folder.glob(pattern)) for folder in (kept, tmp_path / "plain"))
         one, other = ([file.read_bytes() for file in files] for files in found)
         assert one == other != []

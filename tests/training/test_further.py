@@ -16,6 +16,7 @@ import own_tasks
 from conftest import quick
 from delayrl.cli.main import main
 from delayrl.play.run import Run
+from delayrl.run.configuration import versions_of
 from delayrl.training.origin import fitting, parts_of
 from short_runs import arrays, newest, train
 
@@ -42,6 +43,30 @@ def test_a_run_that_goes_on_is_the_longer_run(agent: str, tmp_path: Path) -> Non
     assert {row["configuration"] for row in run.rows()} == {run.config["configuration"]}
     assert len({run.config["configuration"], whole.config["configuration"], short}) == 3  # a result of its own
     assert delayrl.go_on(run.path, 400, progress=False).rows() == run.rows()  # nothing is left to do
+
+
+def test_a_run_that_goes_on_elsewhere_names_all_versions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a run that was stopped, and of one that was complete; reading it changes nothing."""
+    run = train("random", tmp_path / "run", steps=300, callback=lambda step, runs: True)
+    first = run.config["versions"]
+    for name, steps in (("b", 300), ("b", 400), ("a", 500)):
+        monkeypatch.setattr("delayrl.training.resume.versions", lambda name=name: {**first, "commit": name})
+        delayrl.go_on(run.path, steps, progress=False)
+    monkeypatch.setattr("delayrl.training.resume.versions", lambda: {**first, "commit": "c"})
+    delayrl.go_on(run.path, 500, progress=False)
+    assert [used["commit"] for used in versions_of(run.config)] == [first["commit"], "b", "a"]
+    assert run.config["versions"] == first
+
+
+def test_a_copy_of_a_seed_is_no_seed(tmp_path: Path) -> None:
+    """Neither goes on with the others nor counts beside them; under a seed's name it is refused."""
+    train("random", tmp_path, steps=200, seeds=2)
+    shutil.copytree(tmp_path / "seed0", tmp_path / "seed0-before")
+    assert [run.path.name for run in delayrl.go_on(tmp_path, 300, progress=False)] == ["seed0", "seed1"]
+    assert Run(tmp_path / "seed0-before").rows()[-1]["step"] == 200
+    (tmp_path / "seed0-before").rename(tmp_path / "seed2")
+    with pytest.raises(delayrl.DelayRLError, match=r"two runs in .* have the same seed"):
+        delayrl.go_on(tmp_path, 400, progress=False)
 
 
 def test_seeds_go_on_together(tmp_path: Path) -> None:

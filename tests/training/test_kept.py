@@ -51,6 +51,24 @@ def test_a_seed_that_is_new_does_not_restart_the_others(tmp_path: Path) -> None:
     assert not (tmp_path / "seed1").exists()
 
 
+def test_a_seed_that_died_early_does_not_restart_a_finished_one(tmp_path: Path) -> None:
+    """Its folder holds a configuration and nothing else. Alone it begins again, and then both are complete."""
+    train("random", tmp_path / "seed0", seed=0)
+    begun = RunFolder(tmp_path / "seed1")
+    begun.create(RunFolder(tmp_path / "seed0").config | {"seed": 1})
+    assert_refused(tmp_path, "seed0 at 300, .*seed1 at 0", lambda: train("random", tmp_path, seeds=2))
+    train("random", begun.path, seed=1)
+    assert [run.rows()[-1]["step"] for run in train("random", tmp_path, seeds=2)] == [300, 300]
+
+
+def test_rows_without_a_checkpoint_are_not_begun_again(tmp_path: Path) -> None:
+    """Somebody has deleted the checkpoints to save space."""
+    run = train("random", tmp_path / "run")
+    shutil.rmtree(run.path / "checkpoints")
+    assert_refused(tmp_path, "rows up to step 300 and no checkpoint", lambda: train("random", run.path))
+    assert len(train("random", run.path, overwrite=True).rows()) == len(run.rows()) > 0
+
+
 def test_a_refused_overwrite_keeps_the_run(tmp_path: Path) -> None:
     old = train("bpql", tmp_path / "old", steps=101)
     other = train("random", tmp_path / "other", steps=101)

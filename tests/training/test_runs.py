@@ -1,6 +1,7 @@
 """What a script does with runs: curves, training episodes, callbacks, lists of runs, evaluation."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -196,6 +197,20 @@ def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err == "delayrl: compare takes two to 8 runs; got 1\n"
     main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "same.png")])
     assert "all options  the same  the same" in capsys.readouterr().out
+
+
+def test_compare_does_not_pool_other_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the seeds of one folder: trained one after the other, they may differ. A copy of one does not count."""
+    train("random", tmp_path / "two", steps=200, random_steps=100, seeds=2)
+    shutil.copytree(tmp_path / "two" / "seed0", tmp_path / "two" / "seed0-copy")
+    pair = ["compare", str(tmp_path / "two"), str(tmp_path / "two" / "seed0"), "--out", str(tmp_path / "both.png")]
+    main(pair)
+    assert f"A  {tmp_path / 'two'} (2 seeds)" in capsys.readouterr().out
+    train("random", tmp_path / "two" / "seed2", seed=2, steps=200, random_steps=150)
+    with pytest.raises(SystemExit):
+        main(pair)
+    line = f"delayrl: the seeds in {tmp_path / 'two'} differ in random_steps; name runs alone\n"
+    assert capsys.readouterr() == ("", line)
 
 
 def test_compare_says_what_a_run_began_from() -> None:

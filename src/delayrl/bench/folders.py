@@ -5,7 +5,7 @@ RUNS/grids/NAME.json             the grid file that has this name here
 RUNS/TASK-delayN-AGENT-ID/       a cell; grids that contain the same cell share its folder
     cell.json                    its condition and seeds
     lock                         locked by the process that works on the cell
-    journal.jsonl                begun, done, stopped, failed: when, where, with which versions
+    journal.jsonl                begun, done, stopped, failed: when, where
     worker.log                   stderr of the last try
     seed0/ seed1/ …              run folders
 ```

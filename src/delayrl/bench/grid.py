@@ -117,6 +117,11 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
     for other in table.get("include", []):
         path, included_table = _read(str(other), source.parent)
         cells += _expand(included_table, path, included=True)
+    plain = next((key for key in table if key in PRODUCT), None)
+    if cells and plain and "product" not in table and not LISTS.keys() & table.keys():
+        raise DelayRLError(
+            f"{plain} is for the grid's own products, and it has none; the cells it includes keep theirs"
+        )
     products = table.get("product", [{}] if LISTS.keys() & table.keys() or not cells else [])
     if not all(isinstance(item, dict) for item in products):
         raise DelayRLError("products are written as [[product]]")

@@ -17,6 +17,7 @@ from delayrl.bench import folders
 from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
+from delayrl.run import configuration
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.disk import draft, lock
 from delayrl.run.folder import RunFolder
@@ -119,7 +120,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
     table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
     count = 0
     for number, cell in enumerate(grid.cells):
-        p, later = progress(cell, runs), _journal_versions(runs / cell.folder)  # before the rows, which may be more
+        p = progress(cell, runs)  # before the rows, which may be more
         paths = zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
         found = [(path, seed, name_configuration(RunFolder(path).read("rows"))) for path, seed in paths]
         here = Held(sum(len(rows) for *_, rows in found), p.state == "done", p.step)
@@ -128,7 +129,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
             count += _copy_cell(table, elsewhere, cell, number)
             continue
         _insert_cell(table, cell, number, p)
-        count += sum(_insert_run(table, cell, path, seed, rows, later) for path, seed, rows in found if rows)
+        count += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)
     table.commit()
     table.execute("VACUUM")
     return count
@@ -166,13 +167,11 @@ def _copy_cell(table: sqlite3.Connection, file: Path, cell: Cell, number: int) -
     return sum(map(len, rows))
 
 
-def _insert_run(
-    table: sqlite3.Connection, cell: Cell, path: Path, seed: int, rows: list[Row], later: list[dict[str, Any]]
-) -> int:
+def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, rows: list[Row]) -> int:
     """Insert a run and its rows. Returns their number."""
-    config = dict(RunFolder(path).config)
-    first = config.pop("versions", None)
-    versions = _distinct(([first] if first else []) + later)
+    config = RunFolder(path).config
+    versions = configuration.versions_of(config)
+    config = {name: value for name, value in config.items() if name not in ("versions", "later_versions")}
     shared = {k: v for k, v in rows[0].items() if k not in EPISODE and all(row.get(k) == v for row in rows)}
     described = (cell.id, seed, _json(shared), _json(config), _json(versions))
     run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", described).lastrowid
@@ -197,8 +196,7 @@ class Collected(NamedTuple):
 
 def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the versions, commits and hardware that cells were trained with, without duplicates."""
-    first = [config.get("versions") for config in configs_of(cells, runs)]
-    return _distinct([v for v in first if v] + [v for cell in cells for v in _journal_versions(runs / cell.folder)])
+    return _distinct([used for config in configs_of(cells, runs) for used in configuration.versions_of(config)])
 
 
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
@@ -209,11 +207,6 @@ def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
 
 def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [value for i, value in enumerate(values) if value not in values[:i]]
-
-
-def _journal_versions(folder: Path) -> list[dict[str, Any]]:
-    """Return the versions of each start of a cell: they differ where it was resumed elsewhere or after an update."""
-    return [event["versions"] for event in folders.journal(folder) if "versions" in event]
 
 
 def read_table(file: Path) -> Collected:

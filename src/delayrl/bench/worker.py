@@ -66,11 +66,10 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
         if not any(event["event"] == "done" for event in journal(folder)[-1:]):
             note(folder, "done")  # the worker that finished it was killed before it noted that
         return Outcome("done", "")
-    from delayrl.run.provenance import versions
-    from delayrl.training.train import train
+    from delayrl.training.train import train  # it sets JAX up: nothing here may start it before
 
     try:
-        note(folder, "begun", pid=os.getpid(), step=step, versions=versions())
+        note(folder, "begun", pid=os.getpid(), step=step)
         condition = {name: cell[name] for name in CONDITION} | cell["overrides"]
         out = folder if len(seeds) > 1 else seed_folders(folder, seeds)[0]
         train(**condition, seed=seeds[0], seeds=len(seeds), out=out, device=device, progress=False, slim=True)

@@ -9,7 +9,7 @@ from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
 
 LABELS = "ABCDEFGH"
-ABOUT = ("seed", "versions", "cost", "configuration", "format", "privileged")
+ABOUT = ("seed", "versions", "later_versions", "cost", "configuration", "format", "privileged")
 """Entries of a configuration that are no options."""
 
 
@@ -31,6 +31,11 @@ def run(given: argparse.Namespace) -> None:
     if given.out.suffix not in (".png", ".pdf", ".svg"):
         raise DelayRLError(f"--out must end in .png, .pdf or .svg; got {given.out}")
     groups = [seed_runs(path) for path in given.runs]
+    for path, group in zip(given.runs, groups, strict=True):
+        if apart := differences([one.config for one in group]):
+            raise DelayRLError(
+                f"the seeds in {path} differ in {', '.join(name for name, *_ in apart)}; name runs alone"
+            )
     configs = [group[0].config for group in groups]
     labels = LABELS[: len(groups)]
     for label, path, group in zip(labels, given.runs, groups, strict=True):

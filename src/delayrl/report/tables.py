@@ -58,7 +58,7 @@ class TableEntry(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table: rows of (env, delay), columns of labels, and an entry for each (env, delay, label)."""
+    """A table: rows of (env, delay), columns of labels, neither without a number, and an entry for each place."""
 
     kind: Kind
     title: str
@@ -115,6 +115,9 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], resul
         same = overrides.keys() <= SAME_RUN and (result is None or _is_whole(result))  # the paper ran no other variants
         lengths = {r.condition.steps for r in chosen if (r.place.env, r.place.delay) == (env, delay)}
         entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None, len(lengths) > 1)
+    shown = {place for place, entry in entries.items() if entry != TableEntry()}  # all results are in another table
+    rows = [row for row in rows if any((*row, label) in shown for label in columns)]
+    columns = {label for _, _, label in shown}
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
 
 

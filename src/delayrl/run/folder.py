@@ -244,7 +244,7 @@ def seed_folders(run: RunLike) -> list[RunFolder]:
 
 def _below(path: Path) -> list[Path]:
     """Return the run folders of several seeds, by their seeds."""
-    folders = [file.parent for file in path.glob("seed*/config.json")]
+    folders = [file.parent for file in path.glob("seed*/config.json") if file.parent.name[4:].isdigit()]
     return sorted(folders, key=lambda folder: (len(folder.name), folder.name))
 
 

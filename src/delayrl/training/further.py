@@ -73,6 +73,8 @@ def go_on(
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     numbers = [config["seed"] for config in configs]
+    if len({*numbers}) < len(numbers):
+        raise DelayRLError(f"two runs in {path_of(run)} have the same seed; give one of their folders")
     ways = Ways(device=device, track=track, threads=threads, slim=slim, callback=callback, progress=progress)
     train_group(setup, numbers, runs, ways, further=True)
     ended = [Run(one.path) for one in runs]
@@ -117,7 +119,14 @@ def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], 
         except (OSError, DelayRLError) as error:
             raise DelayRLError(f"{run.path} has lost a part of its replay ({error}); {hint}") from error
     own, others = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))
-    changing = ("seed", "versions", "cost", "origin", "configuration")  # a crash may have come between two seeds
+    changing = (
+        "seed",
+        "versions",
+        "later_versions",
+        "cost",
+        "origin",
+        "configuration",
+    )  # a crash may have come between two seeds
     for name in sorted(own.keys() | others.keys()):
         if name not in changing and own.get(name) != others.get(name):
             raise DelayRLError(f"{run.path} has another {name} than the other seeds; train it alone")

@@ -16,7 +16,7 @@ from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, flatten_tree, load_arrays, restore_tree
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.configuration import OLDER, values_of
+from delayrl.run.configuration import OLDER, values_of, versions_of
 from delayrl.run.folder import RunFolder
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
@@ -49,13 +49,14 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     for run in replaced:  # now that nothing can be refused any more
         run.remove()
     config |= {"configuration": group.setup.configuration}
+    used = versions()
     new = [run for run in runs if not run.exists]
     longer = [run for run in runs if run.exists and run.config["schedule"]["steps"] != group.setup.schedule.steps]
     if new or longer:
         config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
     for run, seed in zip(runs, group.seeds, strict=True):
         if run in new:
-            run.create(config | {"versions": versions(), "seed": seed})
+            run.create(config | {"versions": used, "seed": seed})
     if not checkpoints:
         for run in runs:
             run.rewind(-1)
@@ -69,6 +70,8 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
         run.rewind(newest.step)
         if complete:
             run.finish(slim=group.ways.slim or not checkpoint.can_go_on)
+        elif used not in (known := versions_of(run.config)):
+            run.create(run.config | {"later_versions": [*known[1:], used]})
     return state
 
 
@@ -101,10 +104,15 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
     for run, lines in zip(runs, broken, strict=True):
         if lines:
             raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
-    steps = {own[0].step if own else 0 for own in good}
-    crashed = all(run.exists for run in runs) and all(len(own) < 2 for own in good)  # between the seeds' first ones
-    if any(good) and (group.further or not crashed or len(steps - {0}) > 1):
-        at = ", ".join(f"{run.path} at {own[0].step if own else 0:,}" for run, own in zip(runs, good, strict=True))
+    first = group.setup.schedule.evaluate_every
+    steps = [own[0].step if own else 0 for own in good]
+    for run, step in zip(runs, steps, strict=True):
+        last = max((row["step"] for row in run.read("rows")), default=0)
+        if not step and last > first:
+            raise DelayRLError(f"{run.path} has rows up to step {last:,} and no checkpoint; --overwrite starts afresh")
+    crashed = all(run.exists for run in runs) and max(steps) <= first  # between the seeds' first checkpoints
+    if any(good) and (group.further or not crashed or len({*steps} - {0}) > 1):
+        at = ", ".join(f"{run.path} at {step:,}" for run, step in zip(runs, steps, strict=True))
         raise DelayRLError(f"the seeds stand at different steps ({at}); train these alone, or --overwrite them all")
     return []
 
