@@ -9,7 +9,7 @@ import pytest
 from learners import ACT, OBS, counted, random_windows, record, same, seen, trained
 
 from conftest import TINY
-from delayrl.agents.any_age import AnyAge, belief_loss
+from delayrl.agents.any_age import AnyAge, SecondAge, belief_loss
 from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.core import networks
@@ -35,18 +35,18 @@ def test_without_a_delay_it_is_sac() -> None:
     assert same(trained(AGENT, 0)[0].agent, trained(replace(AGENT.bpql, actor_sees="current"), 0)[0].agent)
 
 
-@pytest.mark.parametrize(("law", "pull"), [(None, 0.0), ("uniform:1:4", 0.0), ("uniform:1:4", 1.0)])
-def test_second_views(law: str | None, pull: float) -> None:
-    """On the counter: (s_{t-j}, the j actions since, j / Δ), each j that the episode reaches equally often.
+@pytest.mark.parametrize(("law", "ages"), [(None, "random"), ("uniform:1:4", "random"), ("uniform:1:4", "any")])
+def test_second_views(law: str | None, ages: SecondAge) -> None:
+    """On the counter: (s_{t-j}, the j actions since, j / Δ), each j from 0 to the shown age equally often.
 
-    With a pull, each j from 0 to the shown age.
+    Or each that the episode reaches.
     """
-    agent = replace(AGENT, pull_weight=pull)
+    agent = replace(AGENT, second_age=ages)
     transitions, windows = counted(4, 300, batch=4000, ahead=1, law=law)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     x = np.asarray(agent.second_view(windows, jax.random.key(1)))
     fresh = np.asarray(replace(agent, second_age="zero").second_view(windows, jax.random.key(1)))
-    ages: dict[int, list[int]] = {}
+    found: dict[int, list[int]] = {}
     for i, action in enumerate(np.asarray(windows.action[:, 4, 0]).tolist()):
         step = by_action[action]
         now, length = transitions[step].obs
@@ -54,9 +54,9 @@ def test_second_views(law: str | None, pull: float) -> None:
         since = [transitions[step - j + k].action[0] if k < j else 0 for k in range(4)]
         np.testing.assert_allclose(x[i], [now - j, length, *since, j / 4], rtol=1e-6)
         np.testing.assert_allclose(fresh[i], [now, length, 0, 0, 0, 0, 0])
-        ages.setdefault(int(windows.age[i, 4] if pull else min(now, 4)), []).append(j)
-    assert set(ages) == {0, 1, 2, 3, 4}
-    for age, drawn in ages.items():
+        found.setdefault(int(min(now, 4) if ages == "any" else windows.age[i, 4]), []).append(j)
+    assert set(found) == {0, 1, 2, 3, 4}
+    for age, drawn in found.items():
         counts = np.bincount(drawn, minlength=age + 1)
         assert len(counts) == age + 1  # none older
         expected = len(drawn) / (age + 1)
@@ -121,7 +121,7 @@ def test_annealing_in_parts_of_the_run() -> None:
     assert [float(sudden.weight(jnp.int32(n))) for n in (499, 500)] == [2.0, 0.0]
     with pytest.raises(DelayRLError, match=r"pull_hold must be no later than pull_end, 0\.2; got 0\.3"):
         AnyAge(pull_hold=0.3, pull_end=0.2).for_run(Schedule())
-    with pytest.raises(DelayRLError, match="pull_weight needs a second_age"):
+    with pytest.raises(DelayRLError, match="pull_weight needs a younger second_age"):
         AnyAge(pull_weight=1.0, second_age="none").for_run(Schedule())
 
 

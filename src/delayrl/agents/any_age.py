@@ -2,8 +2,8 @@
 
 Idea: BPQL's critic values actions in the true state s_t, whatever view chose them. A forecast of s_t from x_t learns
 from the states alone, and the policy acts on it. For one and the same s_t the replay holds the view of every age:
-x^(j)_t = (s_{t-j}, a_{t-j}, …, a_{t-1}), j = 0..Δ. So half of each batch is seen at a random age, and the same critic
-teaches every age. π(x^(d)_t) may be pulled towards a younger π(x^(j)_t), with a weight that is annealed to nothing.
+x^(j)_t = (s_{t-j}, a_{t-j}, …, a_{t-1}), j = 0..Δ. So half of each batch is seen at a second age, and the same critic
+teaches all of them. π(x^(d)_t) may be pulled towards a younger π(x^(j)_t), with a weight that is annealed to nothing.
 
 Views: the actor sees a forecast from x_t, at its own and at a second age; the critics see s_t. Unprivileged: s_t and
 the observations in between are learned from once they have arrived.
@@ -33,7 +33,7 @@ from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
 
-SecondAge = Literal["none", "random", "zero"]
+SecondAge = Literal["none", "random", "any", "zero"]
 Pull = Literal["moments", "kl"]
 Encoder = Literal["mlp", "forecast", "transformer"]
 
@@ -45,7 +45,9 @@ class AnyAge:
     bpql: sac.SAC = field(
         default_factory=lambda: sac.SAC(actor_sees="augmented", entropy_unit="scaled", critic_norm="layer")
     )
-    second_age: Annotated[SecondAge, "the age that the actor learns at too: none, random in 0..Δ, or 0"] = "random"
+    second_age: Annotated[SecondAge, "the age that the actor learns at too: random in 0..d, any in 0..Δ, or 0"] = (
+        "random"
+    )
     pull: Annotated[Pull, "distance of the pull: of both policies' moments, or KL(older‖younger)"] = "moments"
     pull_weight: Annotated[float, "initial weight of a pull towards the younger age; 0: none", (0.0, 1e6)] = 0.0
     pull_hold: Annotated[float, "part of the run in which the pull's weight stays constant", (0.0, 1.0)] = 0.25
@@ -70,8 +72,8 @@ class AnyAge:
         """Return the agent with the length of its run. Raises DelayRLError for options that contradict each other."""
         if self.pull_hold > self.pull_end:
             raise DelayRLError(f"pull_hold must be no later than pull_end, {self.pull_end}; got {self.pull_hold}")
-        if self.pull_weight and self.second_age == "none":
-            raise DelayRLError("pull_weight needs a second_age, the age to pull towards; without one give 0")
+        if self.pull_weight and self.second_age in ("none", "any"):
+            raise DelayRLError("pull_weight needs a younger second_age to pull towards, random or zero; else give 0")
         if self.belief_weight and (self.encoder != "transformer" or self.second_age == "none"):
             raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
         return replace(self, run_steps=schedule.steps)
@@ -121,13 +123,10 @@ class AnyAge:
         return state, metrics | ({"pull_weight": weight} if self.pull_weight else {})
 
     def second_view(self, windows: Window, key: Key) -> Float[Array, "batch input"]:
-        """Return x^(j)_t of each window as the actor sees it, j uniform on 0..Δ, or 0.
-
-        No j reaches back behind the start of the episode; with a pull, which is towards the young, none exceeds d.
-        """
+        """Return x^(j)_t of each window as the actor sees it: j uniform on 0..d or 0..Δ in its episode, or 0."""
         now = windows.delay
-        oldest = windows.age[:, now] if self.pull_weight else windows.valid[:, :now].sum(1)
-        share = jax.random.uniform(key, oldest.shape) if self.second_age == "random" else jnp.zeros(oldest.shape)
+        oldest = windows.valid[:, :now].sum(1) if self.second_age == "any" else windows.age[:, now]
+        share = jnp.zeros(oldest.shape) if self.second_age == "zero" else jax.random.uniform(key, oldest.shape)
         ages = jnp.floor(share * (oldest + 1)).astype(jnp.int32)
         return jax.vmap(lambda window, age: network_input(view(window, age=age), "augmented"))(windows, ages)
 
