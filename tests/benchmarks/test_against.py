@@ -1,0 +1,51 @@
+"""The table of any-age beside other agents."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
+
+import against  # noqa: E402
+from synthetic import row, standing  # noqa: E402
+
+from delayrl.report.summary import summarise  # noqa: E402
+
+
+def cell(agent: str, finals: list[float], delay: int | str, **changes: Any) -> Any:
+    made = standing(agent, against.ENV, delay, len(finals), **{"steps": 100_000, "preset": "matched", **changes})
+    return made, finals
+
+
+def test_rows_are_what_has_ended_at_the_same_delay() -> None:
+    """An agent counts with most of its seeds; other presets, lengths and delays without any-age are left out."""
+    five, ten = [1.0, 2, 3, 4, 5], [10.0, 11, 12, 13, 14] * 2
+    cells = [
+        cell("any-age", ten, 25),
+        cell("bpql", five, 25, id="a"),
+        cell("vdpo", ten[:5], 25),
+        cell("bpql", five, 50),
+    ]
+    cells += [cell("lifting", five, 25, preset="small"), cell("a-sac", five, 25, steps=90_000)]
+    rows = [
+        row(made, s, made[0].condition.steps, x, 0, "agent") for made, finals in cells for s, x in enumerate(finals)
+    ]
+    cells.append((standing("dcac", against.ENV, 25, 5, steps=100_000, preset="matched", state="todo", step=0), []))
+    results = summarise(rows, [made for made, _ in cells]).results.values()
+    _, _, *body = against.table([*results]).splitlines()
+    shown = [[text.strip() for text in line.strip("|").split("|")] for line in body]
+    assert [line[:4] for line in shown] == [
+        ["25", "12 ± 1 (10 seeds)", "`vdpo` †", "12 ± 2"],
+        ["25", "12 ± 1 (10 seeds)", "`bpql`", "3 ± 2"],
+    ]
+    assert not shown[0][4].startswith("**")
+    assert shown[1][4].startswith("**+9 (+")
+
+
+@pytest.mark.parametrize(
+    ("text", "clear"), [("+9 (-1 to +19)", False), ("-9 (-19 to -1)", True), ("+9 (+1 to +1,900)", True)]
+)
+def test_what_leaves_out_0_is_bold(text: str, clear: bool) -> None:
+    assert against.bold(text) == (f"**{text}**" if clear else text)
