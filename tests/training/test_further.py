@@ -16,7 +16,7 @@ import own_tasks
 from conftest import quick
 from delayrl.cli.main import main
 from delayrl.play.run import Run
-from delayrl.run.configuration import versions_of
+from delayrl.run.folder import versions_in
 from delayrl.training.origin import fitting, parts_of
 from short_runs import arrays, newest, train
 
@@ -54,7 +54,7 @@ def test_a_run_that_goes_on_elsewhere_names_all_versions(tmp_path: Path, monkeyp
         delayrl.go_on(run.path, steps, progress=False)
     monkeypatch.setattr("delayrl.training.resume.versions", lambda: {**first, "commit": "c"})
     delayrl.go_on(run.path, 500, progress=False)
-    assert [used["commit"] for used in versions_of(run.config)] == [first["commit"], "b", "a"]
+    assert [used["commit"] for used in versions_in(run.config)] == [first["commit"], "b", "a"]
     assert run.config["versions"] == first
 
 

@@ -17,10 +17,9 @@ from delayrl.bench import folders
 from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
-from delayrl.run import configuration
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.disk import draft, lock
-from delayrl.run.folder import RunFolder
+from delayrl.run.folder import RunFolder, versions_in
 from delayrl.run.rows import EPISODE, Row, name_configuration
 
 SCHEMA = 1
@@ -170,7 +169,7 @@ def _copy_cell(table: sqlite3.Connection, file: Path, cell: Cell, number: int) -
 def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, rows: list[Row]) -> int:
     """Insert a run and its rows. Returns their number."""
     config = RunFolder(path).config
-    versions = configuration.versions_of(config)
+    versions = versions_in(config)
     config = {name: value for name, value in config.items() if name not in ("versions", "later_versions")}
     shared = {k: v for k, v in rows[0].items() if k not in EPISODE and all(row.get(k) == v for row in rows)}
     described = (cell.id, seed, _json(shared), _json(config), _json(versions))
@@ -196,7 +195,7 @@ class Collected(NamedTuple):
 
 def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the versions, commits and hardware that cells were trained with, without duplicates."""
-    return _distinct([used for config in configs_of(cells, runs) for used in configuration.versions_of(config)])
+    return _distinct([used for config in configs_of(cells, runs) for used in versions_in(config)])
 
 
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:

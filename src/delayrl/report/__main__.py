@@ -8,7 +8,7 @@ from delayrl.errors import DelayRLError
 from delayrl.report.configurations import read_configs
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
-from delayrl.run.configuration import versions_of
+from delayrl.run.folder import versions_in
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
     given = parser.parse_args()
     try:
         configs = list(read_configs(given.rows))
-        versions = [used for config in configs if isinstance(config, dict) for used in versions_of(config)]
+        versions = [used for config in configs if isinstance(config, dict) for used in versions_in(config)]
         print(report(read_rows(given.rows), [], given.out, given.title, versions, configs))
     except DelayRLError as error:
         print(f"delayrl: {error}", file=sys.stderr)

@@ -107,8 +107,3 @@ def check_names(values: Iterable[str], *configs: Any) -> None:
 def values_of(config: Any) -> dict[str, Any]:
     """Return all options by name: what `override` needs to rebuild the dataclass."""
     return {option.name: list(o) if isinstance(o := option.default, tuple) else o for option in options(config)}
-
-
-def versions_of(config: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the versions, commits and hardware that a run was trained with: one, and those that it went on with."""
-    return [used for used in (config.get("versions"), *config.get("later_versions", [])) if used]

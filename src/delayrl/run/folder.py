@@ -248,6 +248,11 @@ def _below(path: Path) -> list[Path]:
     return sorted(folders, key=lambda folder: (len(folder.name), folder.name))
 
 
+def versions_in(config: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the versions, commits and hardware that a run was trained with: one, and those that it went on with."""
+    return [used for used in (config.get("versions"), *config.get("later_versions", [])) if used]
+
+
 def is_config(file: Path) -> bool:
     """Whether a file is the configuration of a run, of any version: damaged, it stands beside a run's rows."""
     try:

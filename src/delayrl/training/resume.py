@@ -16,8 +16,8 @@ from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, flatten_tree, load_arrays, restore_tree
 from delayrl.run.checkpoint import Checkpoint
-from delayrl.run.configuration import OLDER, values_of, versions_of
-from delayrl.run.folder import RunFolder
+from delayrl.run.configuration import OLDER, values_of
+from delayrl.run.folder import RunFolder, versions_in
 from delayrl.run.provenance import versions
 from delayrl.training.actor import Actor
 from delayrl.training.cost import cost_of
@@ -70,7 +70,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
         run.rewind(newest.step)
         if complete:
             run.finish(slim=group.ways.slim or not checkpoint.can_go_on)
-        elif used not in (known := versions_of(run.config)):
+        elif used not in (known := versions_in(run.config)):
             run.create(run.config | {"later_versions": [*known[1:], used]})
     return state
 
