@@ -6,36 +6,33 @@ from pathlib import Path
 import front
 from ladder import area
 from learning.curves import difference, spread
-from which import ended
+from which import results_of
 
 from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result, delay_order
-from delayrl.report.summary import summarise
 
 ENV, OWN = "HalfCheetah-v5", "`any-age`"
 
 
 def section(files: list[Path]) -> str:
     """Return the table from the cells that have ended, with what its words mean."""
-    tables = [read_table(file) for file in files]
-    results = [r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()]
-    about = (
-        f"{ENV}, preset `matched`, 100,000 steps, `--precision bfloat16`; {front.SEEDS} seeds where no other number "
+    results = results_of(map(read_table, files))
+    about = f"{ENV}, preset `matched`, {front.STEPS[ENV]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where "
+    about += "no other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are "
+    about += (
+        "Welch's, of 95 %, and bold where they leave out 0. *Arithmetic* is that of a step of any-age over that of "
     )
-    about += "is given. ± is the standard deviation over seeds, each of ten episodes; intervals are Welch's, of 95 %, "
-    about += "and bold where they leave out 0. *Arithmetic* is that of a step of any-age over that of the other. "
+    about += "the other. "
     return f"{table(results)}\n\n{about}† reads the true state while it trains; VDPO has `--tokens 1280`."
 
 
 def table(results: list[Result]) -> str:
     """Return a Markdown table: a row for each delay and other agent that has ended on the preset `matched`."""
     chosen: dict[tuple[str, int | str], Result] = {}
-    for result in sorted(filter(ended, results), key=lambda r: r.runs):  # that with most seeds stays
-        condition, delay = result.condition, result.place.delay
-        alike = (result.place.env, condition.preset, condition.steps) == (ENV, "matched", front.STEPS[ENV])
-        if alike and delay != 0 and front.name(result) in front.COLOURS:
-            chosen[front.name(result), delay] = result
+    for result in front.comparable(results):
+        if result.place.env == ENV and result.place.delay != 0:
+            chosen[front.name(result), result.place.delay] = result
     head = ["delay", "any-age's end", "other agent", "its end", "any-age minus it, at the end", "over training"]
     body = []
     for (name, delay), other in sorted(chosen.items(), key=lambda i: (delay_order(i[0][1]), -area(i[1]).mean())):

@@ -340,13 +340,12 @@ def main() -> None:
         arms, goals = ladder.sections(rows, images / "ladder.png")
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
         insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
-        known = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]
-        insert(root / "docs" / "algorithms" / "any-age.md", "against", against.section(known))
     if (ages := HERE / "results" / "halfcheetah-ages.jsonl").exists():
         title = "HalfCheetah-v5, trained under uniform:1:25, five seeds"
         sweeps.draw(sweeps.read(ages), title, images / "ages.png", COLOURS)
         insert(root / "docs" / "algorithms" / "any-age.md", "ages", sweeps.section(ages, "any-age"))
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]
+    insert(root / "docs" / "algorithms" / "any-age.md", "against", against.section(rows))
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)

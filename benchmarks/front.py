@@ -6,12 +6,11 @@ import numpy as np
 from ladder import arm, made_on, rows_of, spread, trained_with
 from learning.curves import curve
 from matplotlib import pyplot
-from which import BUDGET, ended
+from which import BUDGET, ended, results_of
 
 from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
-from delayrl.report.summary import summarise
 from delayrl.report.wording import interval, normalised
 from delayrl.run.condition import Condition
 
@@ -44,7 +43,7 @@ COLOURS = {
 def section(files: list[Path], pictures: Path) -> str:
     """Draw the curves as `result.png`; return the table, with what made its rows."""
     tables = [read_table(file) for file in files]
-    chosen = choose([r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()])
+    chosen = choose(results_of(tables))
     draw(chosen, pictures / "result.png")
     used = [versions for file in files for versions in trained_with(file)]
     steps = " and ".join(f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
@@ -63,13 +62,16 @@ def section(files: list[Path], pictures: Path) -> str:
 def choose(results: list[Result]) -> Chosen:
     """Return what has ended for each arm and case, that with most seeds; delay-free SAC in each case of its task."""
     chosen: Chosen = {}
-    for result in sorted((r for r in results if ended(r) and name(r) in COLOURS), key=lambda r: r.runs):
-        task, own, condition = result.place.env, result.place.delay, result.condition
-        if condition.preset == "matched" and condition.steps == STEPS.get(task):
-            chosen |= {
-                (name(result), (env, delay)): result for env, delay in CASES if env == task and own in (0, delay)
-            }
+    for result in comparable(results):
+        task, own = result.place.env, result.place.delay
+        chosen |= {(name(result), (env, delay)): result for env, delay in CASES if env == task and own in (0, delay)}
     return chosen
+
+
+def comparable(results: list[Result]) -> list[Result]:
+    """Return the results of the arms here, at the preset and budget of their task, those with most seeds last."""
+    alike = [r for r in results if r.condition.preset == "matched" and r.condition.steps == STEPS.get(r.place.env)]
+    return sorted((r for r in alike if ended(r) and name(r) in COLOURS), key=lambda r: r.runs)
 
 
 def short(env: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from ladder import rows_of
 
-from delayrl.bench.results import read_table
+from delayrl.bench.results import Collected, read_table
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result, delay_order
 from delayrl.report.statistics import FEWEST, improvement_interval
@@ -25,8 +25,12 @@ WAITING = "@wait"
 def section(files: list[Path]) -> str:
     """Return a Markdown table with a line for each task and delay on which at least two agents have ended."""
     tables = [read_table(file) for file in files]
-    results = [r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()]
-    return f"{markdown_table(HEAD, lines(results))}\n\n{rows_of(files, tables)}"
+    return f"{markdown_table(HEAD, lines(results_of(tables)))}\n\n{rows_of(files, tables)}"
+
+
+def results_of(tables: Iterable[Collected]) -> list[Result]:
+    """Return the results of all tables."""
+    return [r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()]
 
 
 def lines(results: Iterable[Result]) -> list[list[str]]:

@@ -117,14 +117,12 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
     for other in table.get("include", []):
         path, included_table = _read(str(other), source.parent)
         cells += _expand(included_table, path, included=True)
-    plain = next((key for key in table if key in PRODUCT), None)
-    if cells and plain and "product" not in table and not LISTS.keys() & table.keys():
-        raise DelayRLError(
-            f"{plain} is for the grid's own products, and it has none; the cells it includes keep theirs"
-        )
     products = table.get("product", [{}] if LISTS.keys() & table.keys() or not cells else [])
     if not all(isinstance(item, dict) for item in products):
         raise DelayRLError("products are written as [[product]]")
+    if cells and not products and (unused := next((key for key in table if key in PRODUCT), None)):
+        line = f"{unused} is for the grid's own products, and it has none"
+        raise DelayRLError(f"{line}; the cells it includes keep theirs")
     shared: dict[str, Any] = DEFAULTS | {key: value for key, value in table.items() if key in PRODUCT}
     for number, item in enumerate(products, 1):
         try:

@@ -33,9 +33,8 @@ def run(given: argparse.Namespace) -> None:
     groups = [seed_runs(path) for path in given.runs]
     for path, group in zip(given.runs, groups, strict=True):
         if apart := differences([one.config for one in group]):
-            raise DelayRLError(
-                f"the seeds in {path} differ in {', '.join(name for name, *_ in apart)}; name runs alone"
-            )
+            names = ", ".join(name for name, *_ in apart)
+            raise DelayRLError(f"the seeds in {path} differ in {names}; name runs alone")
     configs = [group[0].config for group in groups]
     labels = LABELS[: len(groups)]
     for label, path, group in zip(labels, given.runs, groups, strict=True):

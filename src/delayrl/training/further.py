@@ -119,14 +119,8 @@ def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], 
         except (OSError, DelayRLError) as error:
             raise DelayRLError(f"{run.path} has lost a part of its replay ({error}); {hint}") from error
     own, others = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))
-    changing = (
-        "seed",
-        "versions",
-        "later_versions",
-        "cost",
-        "origin",
-        "configuration",
-    )  # a crash may have come between two seeds
+    # a crash may have come between two seeds
+    changing = ("seed", "versions", "later_versions", "cost", "origin", "configuration")
     for name in sorted(own.keys() | others.keys()):
         if name not in changing and own.get(name) != others.get(name):
             raise DelayRLError(f"{run.path} has another {name} than the other seeds; train it alone")

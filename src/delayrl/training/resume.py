@@ -107,8 +107,7 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
     first = group.setup.schedule.evaluate_every
     steps = [own[0].step if own else 0 for own in good]
     for run, step in zip(runs, steps, strict=True):
-        last = max((row["step"] for row in run.read("rows")), default=0)
-        if not step and last > first:
+        if not step and (last := max((row["step"] for row in run.read("rows")), default=0)) > first:
             raise DelayRLError(f"{run.path} has rows up to step {last:,} and no checkpoint; --overwrite starts afresh")
     crashed = all(run.exists for run in runs) and max(steps) <= first  # between the seeds' first checkpoints
     if any(good) and (group.further or not crashed or len({*steps} - {0}) > 1):
