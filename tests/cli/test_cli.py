@@ -77,8 +77,9 @@ def test_evaluate(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     config = json.loads((run / "config.json").read_text())
     config["schedule"]["steps"] = 1000
     (unfinished / "config.json").write_text(json.dumps(config))
-    main(["evaluate", str(unfinished), "--episodes", "1"])
-    assert "is not finished: this is its policy after 240 of 1,000 steps" in capsys.readouterr().err
+    for more in ([], ["--json"]):
+        main(["evaluate", str(unfinished), "--episodes", "1", *more])
+        assert "is not finished: this is its policy after 240 of 1,000 steps" in capsys.readouterr().err
     assert "does not fit the env given" in refused(capsys, "evaluate", str(run), "--env", "Pendulum-v1")
 
 

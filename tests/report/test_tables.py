@@ -10,6 +10,7 @@ from delayrl.bench.grid import load_grid
 from delayrl.report.markdown import markdown
 from delayrl.report.summary import summarise
 from delayrl.report.tables import TableEntry, published_values
+from delayrl.report.wording import captions
 from delayrl.run.cell import Progress
 from delayrl.run.condition import resolve
 from delayrl.run.rows import CONFIGURATION
@@ -37,6 +38,25 @@ def test_rows_and_columns_without_a_number_are_left_out() -> None:
         assert table.entries["Ant-v4", 25, "bpql"] == TableEntry()
     assert "| Ant-v4 | 50 | bpql |" in markdown(summary, "", {})
     assert not summarise([], todo).tables
+
+
+def test_an_ablation_has_only_rows_of_a_variant() -> None:
+    """The plain agent's number is in another table, and what the entries are is said once."""
+    plain = [standing("bpql", "Ant-v4", delay, preset="small") for delay in (5, 25)]
+    variants = [
+        standing("bpql", "Ant-v4", delay, preset="small", overrides={"n_steps": 1}, state="todo", step=0)
+        for delay in (5, 25)
+    ]
+    assert not [t for t in summarise(rows(plain), [*plain, *variants]).tables if t.kind == "ablation"]
+    variants[0] = standing("bpql", "Ant-v4", 5, preset="small", overrides={"n_steps": 1})
+    summary = summarise(rows([*plain, variants[0]]), [*plain, *variants])
+    (table,) = [t for t in summary.tables if t.kind == "ablation"]
+    assert (table.rows, table.columns) == ([("Ant-v4", 5)], ["bpql", "bpql n_steps=1"])
+    first, steps, ablation = captions(summary.tables)
+    assert first.startswith("Final return")
+    assert steps.startswith("First evaluation")
+    assert ablation == "Entries are those of the table “Normalised return, constant delays”."
+    assert [first, steps] == list(captions(summary.tables[:2]))
 
 
 def test_ablation_meets_the_papers_columns() -> None:

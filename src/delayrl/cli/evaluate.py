@@ -34,10 +34,10 @@ def run(given: argparse.Namespace) -> None:
     result = evaluate(given.run, given.episodes, given.delay, given.seed, **stored)
     if given.json:
         print(json.dumps(result))
-        return
-    returns = f"return {result['mean_return']:.1f} ± {result['std_return']:.1f} over {result['episodes']} episodes"
-    lowest = f"the lowest {min(result['returns']):.1f}"
-    print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}, {lowest}")
+    else:
+        returns = f"return {result['mean_return']:.1f} ± {result['std_return']:.1f} over {result['episodes']} episodes"
+        lowest = f"the lowest {min(result['returns']):.1f}"
+        print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}, {lowest}")
     _say_unfinished(given.run, result["step"])
 
 

@@ -28,10 +28,10 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
         results = [r for r in summary.results.values() if r.place.setting == setting]
         protocol, preset = _escape(setting.protocol), _escape(setting.preset)
         parts.append(f"## Protocol {protocol}, preset {preset}, {wording.seeds(results)}")
-        for table in summary.tables:
-            if table.setting == setting:
-                caption = _escape(wording.caption(table))
-                parts += [f"### {_escape(table.title)}", caption, _paper_table(summary, table), wording.source(table)]
+        tables = [table for table in summary.tables if table.setting == setting]
+        for table, caption in zip(tables, wording.captions(tables), strict=True):
+            parts += [f"### {_escape(table.title)}", _escape(caption), _paper_table(summary, table)]
+            parts.append(wording.source(table))
         aggregates = [a for a in summary.aggregates if a.setting == setting]
         if aggregates:
             parts += ["### Interquartile mean of the normalised return over tasks", wording.AGGREGATE_CAPTION]

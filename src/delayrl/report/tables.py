@@ -58,7 +58,10 @@ class TableEntry(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table: rows of (env, delay), columns of labels, neither without a number, and an entry for each place."""
+    """A table: rows of (env, delay), columns of labels, neither without a number, and an entry for each place.
+
+    An ablation's rows have a variant's number.
+    """
 
     kind: Kind
     title: str
@@ -116,8 +119,9 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], resul
         lengths = {r.condition.steps for r in chosen if (r.place.env, r.place.delay) == (env, delay)}
         entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None, len(lengths) > 1)
     shown = {place for place, entry in entries.items() if entry != TableEntry()}  # all results are in another table
-    rows = [row for row in rows if any((*row, label) in shown for label in columns)]
-    columns = {label for _, _, label in shown}
+    plain = {label for label in columns if " " not in label} if kind == "ablation" else set()  # not worth a row there
+    rows = [row for row in rows if any((*row, label) in shown for label in columns - plain)]
+    columns = {label for label in columns if any((*row, label) in shown for row in rows)}
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from delayrl.report.comparisons import Comparison
@@ -95,8 +95,16 @@ def entry_texts(table: Table, entry: TableEntry) -> EntryTexts:
     return EntryTexts(ours, interval(entry.interval, write), area, raw, entry.note, theirs)
 
 
-def caption(table: Table) -> str:
-    """Say what stands in a table's entries."""
+def captions(tables: Iterable[Table]) -> Iterator[str]:
+    """Say what stands in the entries of each table; where one of its setting above has the same, name that one."""
+    said: dict[tuple[Setting, str], str] = {}
+    for table in tables:
+        words = _caption(table)
+        first = said.setdefault((table.setting, words), table.title)
+        yield words if first == table.title else f"Entries are those of the table “{first}”."
+
+
+def _caption(table: Table) -> str:
     if table.kind == "steps":
         return (
             "First evaluation at which the mean over seeds reaches that of delay-free SAC after training (×: none), "
