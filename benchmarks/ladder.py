@@ -8,7 +8,8 @@ import contextlib
 import itertools
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ from matplotlib.colors import to_hex
 from scipy import stats
 
 from delayrl.bench.results import Collected, read_table
+from delayrl.errors import DelayRLError
 from delayrl.report import statistics
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
+from delayrl.run.cell import Cell
 from delayrl.run.condition import Condition
 
 AWAY = 1_500
@@ -58,6 +61,7 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     tables = [read_table(file) for file in files]
     for collected in tables:
         cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
+        check_seeds(cell for cell, _ in cells)
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
@@ -67,6 +71,16 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
     slower = update_times(files[0].parent / "arms.jsonl")
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
+
+
+def check_seeds(cells: Iterable[Cell]) -> None:
+    """Raise DelayRLError where an arm has other seeds than 0 to n - 1: seeds are paired by their place."""
+    seeds: dict[str, set[int]] = defaultdict(set)
+    for cell in cells:
+        seeds[arm(cell.condition)] |= {*cell.seeds}
+    for words, own in seeds.items():
+        if own != {*range(len(own))}:
+            raise DelayRLError(f"{words} has ended for seeds {sorted(own)}: run those before them")
 
 
 def made_on(used: list[dict[str, Any]]) -> str:

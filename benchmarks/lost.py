@@ -16,6 +16,7 @@ from matplotlib import pyplot
 from delayrl.bench.results import Collected, read_table
 from delayrl.errors import DelayRLError
 from delayrl.report.markdown import markdown_table
+from delayrl.run.condition import Condition
 
 ENV = "HalfCheetah-v5"
 DRAWN = 25
@@ -39,7 +40,7 @@ def section(files: list[Path], picture: Path) -> str:
         for policy, runs in episodes(table).items():
             known[policy] |= runs
     draw({words: known[DRAWN, words] for words in COLOURS if (DRAWN, words) in known}, picture)
-    chance = [x for evaluations in known.pop((0, CHANCE)).values() for x in evaluations[max(evaluations)]]
+    chance = [x for run in known.pop((0, CHANCE)).values() for evaluation in run.values() for x in evaluation]
     lines = [(delay, words, runs, measure(runs, float(np.mean(chance)))) for (delay, words), runs in known.items()]
     lines.sort(key=lambda line: (line[0], -line[3].mean))
     body = [[str(delay), words, str(len(runs)), *found.cells] for delay, words, runs, found in lines]
@@ -47,26 +48,38 @@ def section(files: list[Path], picture: Path) -> str:
 
 
 def episodes(table: Collected) -> dict[Policy, Runs]:
-    """Return what the policies of the first page's table returned, from the cells that have ended.
+    """Return what the policies of the first page's table returned, those of which all cells have ended.
 
     A reference, which is evaluated without delay, stands at the delay of the policy that is cloned from it. Raises
     DelayRLError if a seed of a policy is there twice.
     """
-    done = {cell.id: cell.condition for cell, progress in table.standing if progress.state == "done"}
+    cells = {cell.id: cell.condition for cell, _ in table.standing if budget(cell.condition)}
+    late = {arm(cells[cell.id]) for cell, progress in table.standing if cell.id in cells and progress.state != "done"}
     known: dict[Policy, Runs] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     cell_of: dict[tuple[Policy, int], str] = {}
     for row in table.rows:
-        condition = done.get(row["cell"])
-        if condition is None or condition.env != ENV or not isinstance(condition.delay, int):
+        condition = cells.get(row["cell"])
+        if condition is None or arm(condition) in late:
             continue
         words = CHANCE if condition.agent == CHANCE else in_words(condition, row["privileged"])
-        if words == CHANCE or (words in COLOURS and condition.steps == STEPS[ENV]):
+        if words == CHANCE or words in COLOURS:
             words += ", its reference without delay" if row["policy"] == "reference" else ""
             policy, seed = (condition.delay, words), row["seed"]
             if cell_of.setdefault((policy, seed), row["cell"]) != row["cell"]:
                 raise DelayRLError(f"seed {seed} of {words} at delay {condition.delay} is in two cells")
             known[policy][seed][row["step"]].append(row["return"])
     return known
+
+
+def budget(condition: Condition) -> bool:
+    """Tell whether a condition has the first page's budget, or is a random policy's: on ENV, at a constant delay."""
+    long = condition.agent == CHANCE or condition.steps == STEPS[ENV]
+    return long and condition.env == ENV and isinstance(condition.delay, int)
+
+
+def arm(condition: Condition) -> tuple[int | str, str]:
+    """Return what all cells of a policy share."""
+    return condition.delay, in_words(condition, privileged=False)
 
 
 def draw(policies: dict[str, Runs], out: Path) -> None:

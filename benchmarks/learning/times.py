@@ -109,11 +109,12 @@ def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
     theirs_does, ours_does = (np.isfinite(median(some, value)[1]) for some in (runs, ours))
     if not (theirs_does or ours_does):
         return "–"
+    if theirs_does and ours_does:
+        return f"{median(runs, value)[1] / median(ours, value)[1]:.1f}"
     theirs, own = (
         np.median([(reached(run, value) or (0, run.seconds[-1]))[1] for run in some]) for some in (runs, ours)
     )
-    sign = "" if theirs_does and ours_does else "> " if ours_does else "< "
-    return f"{sign}{theirs / own:.1f}"
+    return f"{'> ' if ours_does else '< '}{theirs / own:.1f}"
 
 
 def ratios(runs: Runs, ours: str) -> str:

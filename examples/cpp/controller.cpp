@@ -340,6 +340,7 @@ class Policy {
         }
         for (std::size_t j = 0; j < action_size; ++j) {
             action[j] = low_[j] + (std::tanh(action[j]) + 1) * ((high_[j] - low_[j]) / 2);
+            action[j] = std::min(action[j], high_[j]);  // rounding may have brought it beyond
             if (!std::isfinite(action[j])) refuse("numbers so large that the action is not finite");
         }
         return action;

@@ -217,7 +217,7 @@ def test_bad_input() -> None:
             lambda: DelayWrapper(wrap(Journal(named=True), "1", keys=("time",)), "1", keys=("joints",)).reset(keys),
             "already",
         ),
-        (lambda: DelayWrapper(training.wrap(Journal(), 9), "80ms"), "give steps, or in Python step_seconds"),
+        (lambda: DelayWrapper(training.wrap(Journal(), 9), "80ms"), "the wrappers take step_seconds"),
         (lambda: wrap(Journal(), "1", keys=("time", "time")), "keys are different entries"),
         (lambda: wrap(Journal(), "1", keys=("privileged_state",)), "not privileged_state, which is the truth"),
         (lambda: named(keys="legs").reset(keys), r"got keys=\('legs',\)"),

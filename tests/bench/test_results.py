@@ -205,9 +205,13 @@ def test_of_equal_rows_those_that_have_ended_count(finished, tmp_path: Path) -> 
         assert cells_done(copy) == 0
         again(copy)
         assert copy.read_bytes() == whole
-    copy = changed(file, "UPDATE cells SET state = 'failed', step = 30 WHERE state = 'todo'")
+    copy = changed(file, "UPDATE cells SET state = 'running', step = 30 WHERE state = 'todo'")
     collect(grid, gone, copy)
-    assert [p.state for _, p in read_table(copy).standing] == ["done", "failed"]
+    assert [p.state for _, p in read_table(copy).standing] == ["done", "running"]
+    folders.prepare(gone / grid.cells[1].folder, grid.cells[1])
+    folders.note(gone / grid.cells[1].folder, "failed", line="it diverged")  # before the step at which it was seen
+    collect(grid, gone, copy)
+    assert [(p.state, p.step) for _, p in read_table(copy).standing] == [("done", 60), ("failed", 0)]
 
 
 @pytest.mark.parametrize(

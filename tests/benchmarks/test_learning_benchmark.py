@@ -19,7 +19,7 @@ from learning import times  # noqa: E402
 
 import delayrl  # noqa: E402
 from delayrl.report.results import NO_ANCHOR, Anchor, Curves, Place, Result, Setting  # noqa: E402
-from delayrl.run.cell import Progress  # noqa: E402
+from delayrl.run.cell import Cell, Progress  # noqa: E402
 from delayrl.run.condition import Condition  # noqa: E402
 from delayrl.run.cost import Cost  # noqa: E402
 from delayrl.training.recorder import Recorder  # noqa: E402
@@ -58,6 +58,8 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     fast = [times.Run([1], [24.0], [3000.0], 3.0)]
     assert [times.ratio(late, fast, 1000), times.ratio(fast, late, 1000)] == ["> 2.5", "< 0.4"]
     assert times.ratio(late, late, 1000) == "–"
+    most = [times.Run([1], [seconds], [value], 3.0) for seconds, value in ((48.0, 3000.0), (96.0, 3000.0), (60.0, 0.0))]
+    assert times.ratio(most, fast, 1000) == "4.0"  # who does not reach it is last, not at its end
     pairs = {"ours": fast, "slow": [times.Run([1, 2], [60.0, 180.0], [1500.0, 0.0], 3.0)]}
     assert times.ratios({5: pairs}, "ours").splitlines()[2:] == ["| 5 | slow | 2.5 | > 7.5 | > 7.5 |"]
     mixed = [times.Run([1], [24.0], [3000.0], 3.0), times.Run([1, 2], [24.0, 96.0], [0.0, 0.0], 3.0)]
@@ -92,6 +94,16 @@ def result(agent: str, delay: int, returns: list[list[float]], **overrides: floa
     cost = Cost(100, {}, (8,), 1.234e9)
     found = Result(place, condition, Progress("done", 2), len(returns), False, False, curves, cost=cost)
     return replace(found, random_anchor=Anchor(np.full(2, -100.0), np.zeros(2)), reference_anchor=REFERENCE)
+
+
+def test_the_ladder_pairs_seeds_by_place() -> None:
+    """An arm whose first seeds have not ended would be paired with others."""
+    cells = [
+        Cell(Condition("bpql", "X-v0", 25, preset="matched"), seeds, str(seeds)) for seeds in ((0, 1), (2, 3), (3,))
+    ]
+    ladder.check_seeds(cells[:2])
+    with pytest.raises(delayrl.DelayRLError, match=r"`bpql` has ended for seeds \[0, 1, 3\]"):
+        ladder.check_seeds([cells[0], cells[2]])
 
 
 def test_the_ladder_compares_with_bpql() -> None:

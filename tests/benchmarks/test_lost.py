@@ -31,7 +31,7 @@ def test_an_episode_is_lost_below_0_7_of_the_best_above_chance() -> None:
 
 def cell(agent: str, delay: int | str, runs: Any, env: str = ENV, **changes: Any) -> tuple[Standing, Any]:
     """A cell of `matched`, with returns of its seeds by policy and step."""
-    id = f"{agent} {delay} {env} {changes}"
+    id = changes.pop("id", f"{agent} {delay} {env} {changes}")
     return standing(agent, env, delay, 1, id, **({"steps": END, "preset": "matched"} | changes)), runs
 
 
@@ -50,16 +50,19 @@ def collected(*cells: tuple[Standing, Any]) -> Collected:
 
 
 def test_the_table_has_each_policy_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By delay, the best first; of two files each seed once; nothing that runs, is shorter, or is another arm or task.
+    """By delay, the best first; of two files each seed once; nothing that is shorter, or is another arm or task.
 
-    Chance is the last evaluation of the random policy. With it at -1000, 0.7 of 600 more is more than 100 more.
+    Nor a policy with a cell that runs. Chance is the mean of all evaluations of the random policy. With it at -1000,
+    0.7 of 600 more is more than 100 more.
     """
-    chance = {0: {"agent": {1: [9e9], 10_000: [-1000.0, -1000.0]}}}
+    chance = {0: {"agent": {1: [-900.0], 10_000: [-1100.0]}}}
     first = collected(
         cell("random", 0, chance, steps=10_000, overrides={"random_steps": 1000}),
         cell("vdpo", 25, {0: {"agent": EARLY | LOW, "reference": EARLY | HIGH}}, overrides={"tokens": 1280}),
         cell("bpql", 5, {0: {"agent": {HALF: [-400.0, -600.0], END: [-400.0, -400.0]}}}),
         cell("any-age", 25, {0: {"agent": HIGH}}, state="running"),
+        cell("lifting", 25, {0: {"agent": HIGH}}, id="ended"),
+        cell("lifting", 25, {}, id="not begun", state="todo"),
         cell("bpql", 25, {0: {"agent": HIGH}}, overrides={"batch_size": 128}),
         cell("bpql", 25, {0: {"agent": HIGH}}, steps=50_000),
         cell("bpql", "uniform:1:25", {0: {"agent": HIGH}}),

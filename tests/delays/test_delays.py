@@ -319,6 +319,7 @@ def test_a_law_is_in_steps_or_in_time(text: str, words: str) -> None:
         ("54\n61,5\n", "line 2: several columns and no header, or decimal commas"),
         ("delay\n54,3\n", "line 2: several columns and no header, or decimal commas"),
         ("0,3\n1,1\n", "line 1: several columns and no header"),
+        ("time,delay\n0.1,2\n0.2\n", "line 3: 1 of 2 columns; the delay is in the last"),
     ],
 )
 def test_bad_recordings(content: str, words: str, tmp_path: Path) -> None:

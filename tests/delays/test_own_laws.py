@@ -10,6 +10,7 @@ import pytest
 
 import delayrl
 from delayrl.delays import Channel, Delay, as_delay, short_label, stored_delay
+from delayrl.delays.episodes import PerEpisode
 from delayrl.delays.own import OwnLaw
 from delayrl.errors import DelayRLError
 from own_laws import Burst, Cycle, Endless, Plain
@@ -62,6 +63,24 @@ def test_an_own_law_is_played_as_ours() -> None:
     observed = as_delay(Delay(Cycle(), action=1)).observed()
     assert observed.maximum == 3
     assert_alike(delayrl.make("Pendulum-v1", observed), delayrl.make("Pendulum-v1", 3))
+
+
+def test_an_own_law_may_have_all_that_ours_have() -> None:
+    """What an episode draws of it is checked and named all the same."""
+    law = PerEpisode(Shifted())
+    assert str(law) == "episode:<Shifted:1>"
+    with pytest.raises(DelayRLError, match="drew 9 steps, and its maximum is 1"):
+        law.draw(0, np.random.default_rng(0))
+
+
+class Shifted:
+    maximum = 1
+
+    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
+        return 9, 0
+
+    def shifted(self, steps: int) -> "Shifted":
+        return self
 
 
 def assert_alike(one: Any, other: Any) -> None:

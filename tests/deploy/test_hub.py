@@ -17,10 +17,10 @@ import pytest
 from bundles import bundle_of, policy_of
 
 from delayrl.cli.main import main
-from delayrl.deploy import load_bundle
+from delayrl.deploy import load_bundle, packing
 from delayrl.deploy.files import LIMITS, WEIGHTS
 from delayrl.deploy.hub import card, pull, push
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 
 COMMIT = "0123456789" * 4
 SITE = "https://huggingface.co/"  # the client checks the form of this address but does not use it
@@ -77,6 +77,8 @@ class Handler(http.server.BaseHTTPRequestHandler):
             for line in map(json.loads, body.splitlines()):
                 if line["key"] == "file":
                     (home / line["value"]["path"]).write_bytes(base64.b64decode(line["value"]["content"]))
+                if line["key"] == "deletedFile":
+                    (home / line["value"]["path"]).unlink()
             url = f"{SITE}{'/'.join(parts[2:4])}/commit/{COMMIT}"
             self.reply(200, {"commitOid": COMMIT, "commitUrl": url, "success": True})
         elif parts[4] == "paths-info":
@@ -88,9 +90,13 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.reply(404, {"error": "not found"})
 
     def do_GET(self) -> None:
-        hub, parts = self.server, self.path.strip("/").split("/")
+        hub, parts = self.server, self.path.partition("?")[0].strip("/").split("/")
+        if parts[:2] == ["api", "models"]:
+            known = (hub.root / "/".join(parts[2:4])).is_dir()
+            self.reply(200 if known else 404, {"id": "/".join(parts[2:4]), "sha": COMMIT})
+            return
         file = hub.root / "/".join(parts[:2]) / "/".join(parts[4:])
-        if parts[2:4] not in (["resolve", "main"], ["resolve", COMMIT]) or not file.is_file():
+        if parts[2:4] != ["resolve", COMMIT] or not file.is_file():  # no branch, which could have moved
             self.reply(404, {"error": "not found"}, X_Error_Code="EntryNotFound")
             return
         if self.command == "GET":
@@ -132,6 +138,15 @@ def test_there_and_back(hub: Hub, bundle: Path, tmp_path: Path, capsys: pytest.C
         assert (tmp_path / "back" / name).read_bytes() == (bundle / name).read_bytes()
     assert hub.asked == ["bundle.json", "policy.safetensors", "policy.onnx"]
     load_bundle(tmp_path / "back", "onnx")
+
+
+def test_no_graph_of_another_policy_stays(hub: Hub, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    push(bundle, "some/pendulum")
+    monkeypatch.setattr(packing, "find_spec", lambda name: None)
+    with pytest.warns(DelayWarning, match="the bundle has no policy.onnx"):
+        other = bundle_of(bundle.with_name("other"), policy_of("bpql"))
+    push(other, "some/pendulum")
+    assert sorted(file.name for file in (hub.root / "some/pendulum").iterdir()) == ["README.md", "bundle.json", WEIGHTS]
 
 
 def test_card(hub: Hub, bundle: Path) -> None:

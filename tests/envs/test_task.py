@@ -17,6 +17,7 @@ from delayrl.envs.making import delay_of
 from delayrl.envs.task import Part, Task, as_task, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import resolve
+from delayrl.wrappers.layers import limit_of
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
 
 
@@ -167,6 +168,12 @@ def test_normalised_observations() -> None:
     ours.set_wrapper_attr("update_running_mean", False)
     ours.step(ours.action_space.sample())
     assert round(moments.count) == 10
+
+
+def test_the_least_time_limit_counts() -> None:
+    longer = TimeLimit(gym.make("Pendulum-v1"), 1000)
+    assert limit_of(longer) == limit_of(TimeLimit(longer, 2000)) == 200
+    assert limit_of(TimeLimit(longer, 50)) == 50
 
 
 def test_the_limit_of_an_environment_without_a_spec() -> None:

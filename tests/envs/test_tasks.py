@@ -54,3 +54,9 @@ def test_no_delay_is_longer_than_an_episode(delay: int | str) -> None:
 def test_bad_tasks(task: str, words: str) -> None:
     with pytest.raises(delayrl.DelayRLError, match=words):
         delayrl.make(task, 1)
+
+
+def test_a_task_that_does_not_say_how_long_a_step_is() -> None:
+    with pytest.raises(delayrl.DelayRLError, match=r"\(no `dt`\): give steps, or the task a `dt`; in Python"):
+        delayrl.make("delayrl/Counter-v0", "80ms")
+    assert delayrl.make("delayrl/Counter-v0", "80ms", step_seconds=0.02).delay.maximum == 4

@@ -491,6 +491,24 @@ def stamps(path: Path, made: np.ndarray, delay: np.ndarray | float) -> Path:
     return write(path, {"stamp": made, "received": made + delay})
 
 
+def test_stamps_of_several_recordings(tmp_path: Path) -> None:
+    """The clock starts again in the second; together they show what each shows alone."""
+    made, delay = np.tile(ROW * np.arange(300), 2), np.tile([2.5, 3.5], 300) * ROW
+    columns = {"stamp": made, "received": made + delay, "flight": np.repeat([1, 2], 300)}
+    path = write(tmp_path / "log.csv", columns)
+    with pytest.raises(DelayRLError, match=r"row 301: the stamp goes back; sort .* or name a column with --episode"):
+        from_log(path)
+    both = from_log(path, episode="flight", warm_up=0)
+    once = from_log(stamps(tmp_path / "once.csv", made[:300], delay[:300]), warm_up=0)
+    assert (both.rows, once.rows) == (600, 300)
+    for name in ("row", "in_step", "train_with", "longest"):
+        assert getattr(both, name) == pytest.approx(getattr(once, name)), name
+    assert max(both.replay) == max(once.replay)
+    columns["flight"] = np.arange(600)
+    with pytest.raises(DelayRLError, match="column flight changes in every row"):
+        from_log(write(tmp_path / "every.csv", columns), episode="flight")
+
+
 @pytest.mark.parametrize("every", [1, 2, 3])
 def test_ages_of_a_saved_recording(every: int, tmp_path: Path) -> None:
     """A sensor in step with the loop, a fifth lost, some overtaken: the recording shows the ages of the log."""

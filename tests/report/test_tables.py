@@ -55,7 +55,7 @@ def test_an_ablation_has_only_rows_of_a_variant() -> None:
     first, steps, ablation = captions(summary.tables)
     assert first.startswith("Final return")
     assert steps.startswith("First evaluation")
-    assert ablation == "Entries are those of the table “Normalised return, constant delays”."
+    assert ablation == "Entries are written as in “Normalised return, constant delays”."
     assert [first, steps] == list(captions(summary.tables[:2]))
 
 

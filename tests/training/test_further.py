@@ -16,8 +16,9 @@ import own_tasks
 from conftest import quick
 from delayrl.cli.main import main
 from delayrl.play.run import Run
+from delayrl.run.arrays import Arrays
 from delayrl.run.folder import versions_in
-from delayrl.training.origin import fitting, parts_of
+from delayrl.training.origin import RENAMED, _renamed, fitting, parts_of
 from short_runs import arrays, newest, train
 
 module = import_module("delayrl.training.train")  # `delayrl.training` may show its function under that name
@@ -302,6 +303,25 @@ def test_parts_of_a_state() -> None:
         "log_temperature": ["log_temperature"],
         "reference.log_temperature": ["reference.log_temperature"],
     }
+
+
+def test_agents_inside_agents_fit_each_other() -> None:
+    """AD-SAC's auxiliary learner without a delay is a SAC, as VDPO's reference and BPQL's critics are."""
+    sizes = {"actor": 2, "critic": 3}
+    alone = {f"{name}.0.w": np.zeros(size) for name, size in sizes.items()}
+    inside = {
+        inner: {f"{inner}.{name}": x for name, x in alone.items()} for inner in ("auxiliary", "reference", "delayed")
+    }
+
+    def fitted(fresh: Arrays, stored: Arrays) -> set[str]:
+        return {part for old, new in RENAMED for part in fitting(fresh, _renamed(stored, old, new))}
+
+    for inner, own in inside.items():
+        assert fitted(own, alone) == {f"{inner}.actor", f"{inner}.critic"}
+        assert fitted(alone, own) == {"actor", "critic"}
+        assert all(fitted(own, other) == {f"{inner}.actor", f"{inner}.critic"} for other in inside.values())
+    augmented = {"actor.0.w": np.zeros(5)} | inside["auxiliary"]  # ad-sac, beside bpql
+    assert fitted({"actor.0.w": np.zeros(5), "critic.0.w": np.zeros(3)}, augmented) == {"actor", "critic"}
 
 
 def test_a_temperature_alone_is_not_taken() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 import delayrl
 from delayrl.envs.making import make
+from delayrl.play import evaluation
 from delayrl.play.policy import spec_of
 from delayrl.run.folder import RunFolder, hold
 from delayrl.training import checks, machine
@@ -78,6 +79,17 @@ def test_a_refused_overwrite_keeps_the_run(tmp_path: Path) -> None:
     (tmp_path / "seed1" / "notes.txt").write_text("mine")
     shutil.copytree(old.path, tmp_path / "seed0")
     assert_refused(tmp_path, "seed1 is not empty", lambda: train("bpql", tmp_path, seeds=2, overwrite=True))
+
+
+def test_too_few_simulators_for_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A licence may allow that of training, and no more."""
+
+    def make(*task: object, **options: object) -> None:
+        raise delayrl.DelayRLError("only one simulator may run")
+
+    old = train("random", tmp_path / "old")
+    monkeypatch.setattr(evaluation, "make", make)
+    assert_refused(tmp_path, "only one simulator", lambda: train("random", old.path, seed=1, overwrite=True))
 
 
 @pytest.mark.parametrize(("seeds", "words"), [(1, "the replay takes 0.0 GB"), (2, "replays of 2 seeds take 0.0 GB")])

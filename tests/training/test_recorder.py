@@ -16,6 +16,7 @@ from delayrl.play.evaluation import EVALUATION, Episodes, reset_seed
 from delayrl.run.condition import resolve
 from delayrl.training import recorder
 from delayrl.training.recorder import Recorder
+from delayrl.training.state import Ways
 
 STATE = Random().init(Spec(2, 1, 2), jax.random.key(0))
 SEEDS, RETURNS, LENGTHS = [5, 6], np.array([[1.0, 2.0], [4.0, 8.0]]), np.array([[7, 6], [5, 4]])
@@ -25,7 +26,10 @@ SEEDS, RETURNS, LENGTHS = [5, 6], np.array([[1.0, 2.0], [4.0, 8.0]]), np.array([
 def played(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Two seeds, two episodes; their recorder, the rows it appends, what it tracks, what its evaluator is given."""
     rows, tracked, given = [], [], []
-    tracker = lambda kind, path: SimpleNamespace(write=lambda step, values: tracked.append((path, step, values)))  # noqa: E731
+
+    def tracker(kind: None, path: int, step: int) -> Any:
+        return SimpleNamespace(write=lambda step, values: tracked.append((path, step, values)))
+
     monkeypatch.setattr(recorder, "Tracker", tracker)
 
     def started(protocol: str) -> Any:
@@ -33,7 +37,9 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Any:
         folders = [SimpleNamespace(path=seed, append=lambda kind, new: rows.extend(new)) for seed in SEEDS]
         keys, spec = jax.vmap(jax.random.key)(np.array(SEEDS)), Spec(2, 1, 2)
         group: Any = SimpleNamespace(setup=setup, seeds=SEEDS, folders=folders, keys=keys, spec=spec, apply=map)
-        made = Recorder(group, STATE, make("delayrl/Counter-v0", as_delay(2)), None)
+        group.ways, env = Ways(), make("delayrl/Counter-v0", as_delay(2))
+        state: Any = SimpleNamespace(step=0, learner=SimpleNamespace(agent=STATE), actors=[SimpleNamespace(env=env)])
+        made = Recorder(group, state)
         made._evaluators = {"agent": lambda *args: given.append(args) or Episodes(RETURNS, LENGTHS)}  # type: ignore
         return made
 

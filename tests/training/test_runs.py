@@ -145,6 +145,8 @@ def test_evaluate_takes_a_run_its_folder_or_a_policy(vdpo: Run) -> None:
     assert delayrl.evaluate(policy, episodes=2, env="Reacher-v5", delay=1)["delay"] == 1
     with pytest.raises(delayrl.DelayRLError, match="a policy does not say what its task is: give env"):
         delayrl.evaluate(policy)
+    with pytest.raises(delayrl.DelayRLError, match="leave agent out"):
+        delayrl.evaluate(policy, env="Reacher-v5", agent="vdpo")
 
 
 def test_runs_on_the_command_line(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,7 @@
 """The wrappers equal a brute-force account of every message, for every law, rule and channel."""
 
+import contextlib
+import functools
 import sys
 from typing import Any
 
@@ -566,6 +568,14 @@ def test_one_delay_is_enough() -> None:
         with pytest.raises(delayrl.DelayRLError, match=r"delayed already: .* the whole delay inside"):
             DelayedVector(vectors(lambda d=inside: Delayed(Journal(5), d)), 2)
     assert DelayedVector(vectors(lambda: Delayed(Journal(5), 0)), 2).delay == as_delay(2)
+
+
+def test_one_delay_is_enough_in_other_processes() -> None:
+    """Their environments show what they are at the first reset."""
+    wrappers, spawn = [functools.partial(Delayed, delay=2)], {"context": "spawn"}  # JAX warns of forks
+    inside = gym.make_vec("Pendulum-v1", 2, "async", wrappers=wrappers, vector_kwargs=spawn)
+    with contextlib.closing(DelayedVector(inside, 1)) as env, pytest.raises(delayrl.DelayRLError, match="already"):
+        env.reset(seed=0)
 
 
 def vectors(make: Any, **options: Any) -> Any:

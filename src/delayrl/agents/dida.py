@@ -5,7 +5,7 @@ Ross et al. 2011). The expert acts first, then the student, in rounds. Every vis
 action in the true state, whoever acted.
 
 Views: the expert sees s_t, the student x_t. Privileged: the expert acts on the true state in the first part of the run.
-(Labels need no privilege: a step is learned from only after its state has arrived.)
+(Labels would need no privilege if the student waited for them. Here it does not.)
 
 The expert's steps count towards the run's environment steps: it learns and acts up to step `expert_steps`, rounded
 up to whole rounds.

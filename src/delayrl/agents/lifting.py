@@ -13,6 +13,7 @@ Deviations from the paper and from the released code are numbered in docs/algori
 """
 
 import functools
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, NamedTuple
 
@@ -46,7 +47,9 @@ class Lifting:
 
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, initial_temperature=0.2))
     lifting_weight: Annotated[float, "initial weight of the lifting loss", (0.0, 1e6)] = 10.0
-    lifting_hold: Annotated[int, "environment step up to which the weight stays constant", "scales"] = 250_000
+    lifting_hold: Annotated[int, "environment step until which the weight is constant", "scales", (0, math.inf)] = (
+        250_000
+    )
     lifting_end: Annotated[int, "environment step at which the weight, falling linearly, reaches 0", "scales"] = 750_000
 
     privileged = False
@@ -97,7 +100,7 @@ class Lifting:
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """Update the reference by SAC, then BPQL with the lifting loss, both on the same batch."""
         reference_key, delayed_key = jax.random.split(key)
-        # only the delayed policy's entropy moves the temperature; the reference's change to it is discarded
+        # only the delayed policy's entropy moves the temperature; the reference's change to it is discarded afterwards
         shared = state.delayed.log_temperature
         reference = state.reference._replace(log_temperature=shared)
         reference, of_reference = self.reference.update(reference, windows, reference_key, count)

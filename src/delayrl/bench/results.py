@@ -47,7 +47,10 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 
 
 class Held(NamedTuple):
-    """What some place holds of a cell. The greatest is taken."""
+    """What some place holds of a cell. The greatest is taken; run folders yield to more rows or an end alone.
+
+    Their step may fall: a running cell's is ahead of the checkpoint from which it goes on once it has died.
+    """
 
     rows: int = 0
     done: bool = False
@@ -124,7 +127,9 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
         found = [(path, seed, name_configuration(RunFolder(path).read("rows"))) for path, seed in paths]
         here = Held(sum(len(rows) for *_, rows in found), p.state == "done", p.step)
         elsewhere = max(held, key=lambda file: held[file].get(cell.id, Held()), default=None)
-        if elsewhere and held[elsewhere].get(cell.id, Held()) > here:
+        best = held[elsewhere].get(cell.id, Held()) if elsewhere else Held()
+        begun = (runs / cell.folder).is_dir()
+        if elsewhere and (best[:2] > here[:2] or (best > here and not begun)):
             count += _copy_cell(table, elsewhere, cell, number)
             continue
         _insert_cell(table, cell, number, p)

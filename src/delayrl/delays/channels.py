@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from delayrl.delays import laws
-from delayrl.delays.episodes import PerEpisode, Sum
+from delayrl.delays.episodes import OURS, PerEpisode, Sum
 from delayrl.delays.laws import Constant, DelayLaw
-from delayrl.delays.own import OwnLaw, is_law, own_law
+from delayrl.delays.own import is_law, own_law
 from delayrl.errors import DelayRLError
 
 Rule = Literal["newest", "fifo", "raw", "wait"]
@@ -16,7 +16,6 @@ Rule = Literal["newest", "fifo", "raw", "wait"]
 are ignored. `fifo`: the same, but no message overtakes another. `raw`: s_{t-d} with d drawn anew at each step, so that
 the observation may go back in time. `wait`: each message counts once the longest delay has passed since it was sent."""
 NO_DELAY = Constant(0)
-OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, PerEpisode, Sum, OwnLaw)
 
 
 @dataclass(frozen=True)

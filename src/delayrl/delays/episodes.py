@@ -6,8 +6,9 @@ from typing import Self
 
 import numpy as np
 
-from delayrl.delays.laws import DelayLaw, uniform
-from delayrl.delays.own import own_law
+from delayrl.delays import laws
+from delayrl.delays.laws import Constant, DelayLaw, uniform
+from delayrl.delays.own import OwnLaw, own_law
 from delayrl.delays.recordings import next_whole
 from delayrl.errors import DelayRLError
 
@@ -22,7 +23,7 @@ class PerEpisode:
     law: DelayLaw
 
     def __post_init__(self) -> None:
-        if not hasattr(self.law, "shifted"):  # as all laws of ours have
+        if not isinstance(self.law, OURS):
             object.__setattr__(self, "law", own_law(self.law))
 
     @property
@@ -66,6 +67,10 @@ class Sum:
     def shifted(self, steps: int) -> Self:
         """Return the law whose delays are longer by `steps`."""
         return replace(self, law=self.law.shifted(steps))
+
+
+OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, PerEpisode, Sum, OwnLaw)
+"""All classes of laws. Others are a user's, which `own_law` makes one of these."""
 
 
 def any_phase(shortest: float, longest: float, period: float = 1.0) -> tuple[int, int]:

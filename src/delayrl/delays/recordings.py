@@ -63,6 +63,9 @@ def _cells(path: Path) -> list[tuple[str, str]]:
     has_header = bool(cells) and not is_number(cells[0][1])
     columns = len(rows[0][1]) if has_header else 1
     for place, row in rows:
+        if len(row) < columns:
+            line = f"{path}, {place}: {len(row)} of {columns} columns"
+            raise DelayRLError(f"{line}; the delay is in the last: complete the line, or remove it")
         if len(row) > columns:
             line = f"{path}, {place}: several columns and no header, or decimal commas"
             raise DelayRLError(f"{line}; write one number a line, such as 54.3, or name the columns in the first line")
@@ -78,7 +81,8 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     if not unit:
         return number
     if not step_seconds:
-        raise DelayRLError("the task does not say how long a step is (no `dt`): give steps, or in Python step_seconds")
+        hint = "give steps, or the task a `dt`; in Python, `make` and the wrappers take step_seconds"
+        raise DelayRLError(f"the task does not say how long a step is (no `dt`): {hint}")
     return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds
 
 

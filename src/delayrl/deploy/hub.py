@@ -30,7 +30,9 @@ def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
     with _one_line(f"cannot push to {repo}"):
         url = api.create_repo(repo, private=private, exist_ok=True)
         content = {CARD: card(metadata, repo).encode(), **files}
-        operations = [hub.CommitOperationAdd(path_in_repo=name, path_or_fileobj=data) for name, data in content.items()]
+        operations: list[Any] = [hub.CommitOperationAdd(name, data) for name, data in content.items()]
+        if GRAPH not in files and api.get_paths_info(repo, [GRAPH]):  # of another policy
+            operations.append(hub.CommitOperationDelete(GRAPH))
         api.create_commit(repo, operations, commit_message=f"delayrl bundle {metadata['checksum'][:12]}")
     return str(url)
 
@@ -52,6 +54,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
     names = [DOCUMENT, WEIGHTS, GRAPH]
     with tempfile.TemporaryDirectory(prefix="delayrl-pull-") as folder:
         with _one_line(f"cannot pull from {repo}"):
+            revision = api.repo_info(repo, revision=revision).sha  # what is checked is what is downloaded
             paths = api.get_paths_info(repo, names, revision=revision)
             sizes = {path.path: getattr(path, "size", None) for path in paths}
         for name in (name for name in names if name in sizes):

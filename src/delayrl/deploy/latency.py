@@ -49,7 +49,7 @@ def latency(
     """
     if not 1 <= decisions <= 10_000_000:
         raise DelayRLError(f"decisions must lie in 1 .. 10,000,000; got {decisions}")
-    task = json.dumps([str(bundle), backend, decisions, None if ages is None else list(ages)])
+    task = json.dumps([str(bundle), backend, decisions, None if ages is None else [int(age) for age in ages]])
     # -P: do not import modules from the working folder, which may be the bundle's
     command = [sys.executable, "-P", "-m", "delayrl.deploy.latency", task]
     done = subprocess.run(command, env=os.environ | ONE_THREAD, capture_output=True, text=True)

@@ -19,7 +19,7 @@ from delayrl.wrappers.layers import name_of as name_of
 from delayrl.wrappers.layers import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
 
-OPTIONS = ("env_kwargs", "wrappers", "flatten", "normalise", "rescale", "history", "fill")
+OPTIONS = ("env_kwargs", "wrappers", "flatten", "normalise", "rescale", "history", "fill", "step_seconds")
 """Of `make` itself. All others are keyword arguments of what makes the environment."""
 
 
@@ -34,6 +34,7 @@ def make(
     rescale: bool = False,
     history: int | None = None,
     fill: Fill = "first",
+    step_seconds: float | None = None,
     **options: Any,
 ) -> Delayed:
     """Make a task with a delay.
@@ -51,6 +52,7 @@ def make(
         rescale: whether actions, in `info` too, are in [-1, 1] instead of the task's own range.
         history: rows of the action history, as `Delayed`.
         fill: what is shown before anything has arrived, as `Delayed`.
+        step_seconds: the length of a step, for delays given as times; None to ask the task.
         **options: more keyword arguments, which no name or text records, e.g. `render_mode="rgb_array"`.
 
     Raises:
@@ -67,7 +69,7 @@ def make(
         low, high = task.action_space.low, task.action_space.high
         idle = 2 * (np.clip(0, low, high) - low) / (high - low) - 1
         task = RescaleAction(task, np.float32(-1), np.float32(1))
-    return Delayed(task, delay, history, fill, idle)
+    return Delayed(task, delay, history, fill, idle, step_seconds)
 
 
 def _made(task: Task, options: dict[str, Any]) -> Any:

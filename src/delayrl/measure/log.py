@@ -159,7 +159,7 @@ def from_log(
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
         if value is not None and not (np.isfinite(value) and value >= least):
             raise DelayRLError(f"--{name} is a time in seconds; got {value}")
-    exact = reading.read_stamps(path, stamp, received, unit)
+    exact = reading.read_stamps(path, stamp, received, episode, unit)
     if exact is not None:
         estimated = _from_stamps(path, *exact, period, warm_up)
     else:
@@ -172,21 +172,28 @@ def from_log(
     return estimated
 
 
-def _from_stamps(path: Path, made: Array, arrived: Array, period: float | None, warm_up: float | None) -> Estimated:
-    delays = arrived - made
-    if (np.diff(made) < 0).any():
-        row = int(np.argmax(np.diff(made) < 0)) + 2
-        raise DelayRLError(f"{path}, row {row}: the stamp goes back; sort the rows by when observations were made")
+def _from_stamps(
+    path: Path, made: Array, arrived: Array, episode: Array, period: float | None, warm_up: float | None
+) -> Estimated:
+    delays, gaps, inside = arrived - made, np.diff(made), episode[1:] == episode[:-1]
+    if (back := inside & (gaps < 0)).any():
+        hint = "sort the rows by when observations were made, or name a column with --episode that changes where a new "
+        raise DelayRLError(f"{path}, row {int(np.argmax(back)) + 2}: the stamp goes back; {hint}recording begins")
     if delays.min() < 0:
         row = int(np.argmin(delays))
         hint = "the clocks differ by at least that; synchronise them (PTP, NTP), or stamp both ends with one clock"
         raise DelayRLError(f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made: {hint}")
-    first = np.diff(made, prepend=-np.inf) > 0  # a row of the control loop may show the observation of the row before
-    made, delays = made[first], delays[first]
-    if len(made) < 10:
-        raise DelayRLError(f"{path} has {len(made)} different stamps: too short, at least 10 are needed")
-    start = made - made[0]
-    row_spacing = float(np.median(np.diff(made)))
+    first = np.append(
+        True, ~inside | (gaps > 0)
+    )  # a row of the control loop may show the observation of the row before
+    if first.sum() < 10:
+        raise DelayRLError(f"{path} has {first.sum()} different stamps: too short, at least 10 are needed")
+    row_spacing = float(np.median(gaps[inside & (gaps > 0)]))
+    pause = (
+        2 * reading.GAP * row_spacing
+    )  # each recording begins this long after the one before, whatever its clock says
+    start = np.append(0.0, np.cumsum(np.where(inside, gaps, pause)))[first]
+    made, delays = made[0] + start, delays[first]
     warm = WARM_UP * float(start[-1]) if warm_up is None else warm_up
     used = start >= warm
     if used.sum() < 10:

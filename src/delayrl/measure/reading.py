@@ -62,17 +62,20 @@ def read_signals(
     both = set(groups["commands"]) & set(groups["observations"])
     if both:
         raise DelayRLError(f"{path}: {_few(sorted(both))} would be both a command and an observation; use --commands")
-    number = table.find(episode, ("episode", "episode_index"), "episodes", "--episode")
-    seconds = table.column(stamps) * UNITS[unit]
-    episodes = table.column(number) if number else np.zeros(len(seconds))
+    seconds, episodes = table.column(stamps) * UNITS[unit], table.recordings(episode)
     _check_times(path, stamps, seconds, episodes)
     us, u_names = table.join(groups["commands"])
     ys, y_names = table.join(groups["observations"])
     return Log(seconds - seconds[0], us, ys, episodes, u_names, y_names)
 
 
-def read_stamps(path: Path, stamp: str | None, received: str | None, unit: str) -> tuple[Array, Array] | None:
-    """Return when observations were made and when they arrived, in seconds, [N] each; None without both columns."""
+def read_stamps(
+    path: Path, stamp: str | None, received: str | None, episode: str | None, unit: str
+) -> tuple[Array, Array, Array] | None:
+    """Return when observations were made, when they arrived, in seconds, and which recordings they are in, [N] each.
+
+    None without both columns of times.
+    """
     table = _Table(path)
     made = table.find(stamp, ("stamp",), "send times", "--stamp")
     arrived = table.find(received, ("received",), "arrival times", "--received")
@@ -81,7 +84,7 @@ def read_stamps(path: Path, stamp: str | None, received: str | None, unit: str) 
             other = "--received, when observations arrived" if made else "--stamp, when observations were made"
             raise DelayRLError(f"{path}: stamps need both times; it has no column for {other}")
         return None
-    return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit]
+    return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit], table.recordings(episode)
 
 
 def resample(log: Log) -> tuple[Log, float]:
@@ -144,6 +147,14 @@ class _Table:
         if values.shape[1] != 1:
             raise DelayRLError(f"{self.path}: column {name} holds vectors; it must hold one number a row")
         return values[:, 0]
+
+    def recordings(self, given: str | None) -> Array:
+        """Return the column that changes where a new recording begins, [N]; zeros if there is none."""
+        name = self.find(given, ("episode", "episode_index"), "episodes", "--episode")
+        numbers = self.column(name) if name else np.zeros(len(self._columns[self.names[0]]))
+        if len(numbers) > 1 and np.diff(numbers).all():
+            raise DelayRLError(f"{self.path}: column {name} changes in every row, and not only between recordings")
+        return numbers
 
     def matrix(self, name: str) -> Array:
         """Return a column of numbers as [N, 1], or one of vectors as [N, size]."""

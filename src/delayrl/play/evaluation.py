@@ -195,6 +195,8 @@ def evaluate(
     if isinstance(run, Policy):
         if env is None:
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
+        if agent is not None:
+            raise DelayRLError("a policy is of its own agent: leave agent out, or give a run")
         task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
     else:
         config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)

@@ -63,10 +63,7 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "agents": [{"label": label, "name": summary.name(label), "style": styles[label]} for label in agents],
         "results": [_result(r, names) for r in results],
         "anchors": [_anchors(r, names) for r in anchored.values()],
-        "tables": [
-            _table(table, caption, names)
-            for table, caption in zip(summary.tables, wording.captions(summary.tables), strict=True)
-        ],
+        "tables": [_table(t, names) for t in summary.tables],
         "costs": [wording.costs(summary, s) for s in settings],
         "costHead": wording.COST_HEAD,
         "costCaption": wording.COST_CAPTION,
@@ -137,13 +134,14 @@ def _anchors(r: Result, names: Names) -> dict[str, Any]:
     return {"setting": setting, "task": task, "total": r.condition.steps, "threshold": wording.threshold(r), **values}
 
 
-def _table(table: Table, caption: str, names: Names) -> dict[str, Any]:
+def _table(table: Table, names: Names) -> dict[str, Any]:
     rows = []
     for env, delay in table.rows:
         entries = [table.entries[env, delay, column] for column in table.columns]
         texts = [[_rounded(e.value), e.partial, *wording.entry_texts(table, e)] for e in entries]
         rows.append([names["tasks"].index(env), names["delays"].index(delay), texts])
-    labels = {"kind": table.kind, "title": table.title, "caption": f"{caption} {wording.source(table)}".strip()}
+    caption = " ".join(filter(None, (wording.caption(table), wording.source(table))))
+    labels = {"kind": table.kind, "title": table.title, "caption": caption}
     columns = [names["agents"].index(column) for column in table.columns]
     return labels | {"setting": names["settings"].index(table.setting), "columns": columns, "rows": rows}
 

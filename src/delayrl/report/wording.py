@@ -96,15 +96,15 @@ def entry_texts(table: Table, entry: TableEntry) -> EntryTexts:
 
 
 def captions(tables: Iterable[Table]) -> Iterator[str]:
-    """Say what stands in the entries of each table; where one of its setting above has the same, name that one."""
-    said: dict[tuple[Setting, str], str] = {}
+    """Say what stands in the entries of each table of a setting; where one above has the same, name that one."""
+    said: dict[str, str] = {}
     for table in tables:
-        words = _caption(table)
-        first = said.setdefault((table.setting, words), table.title)
-        yield words if first == table.title else f"Entries are those of the table “{first}”."
+        first = said.setdefault(caption(table), table.title)
+        yield caption(table) if first == table.title else f"Entries are written as in “{first}”."
 
 
-def _caption(table: Table) -> str:
+def caption(table: Table) -> str:
+    """Say what stands in a table's entries."""
     if table.kind == "steps":
         return (
             "First evaluation at which the mean over seeds reaches that of delay-free SAC after training (×: none), "

@@ -58,8 +58,11 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
-    first = min((-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()), default=0)
-    if first > schedule.steps:
+    firsts = [-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()]
+    if firsts and (last := max(firsts)) > schedule.steps >= min(firsts):
+        line = f"a part would learn nothing: its first update is at step {last:,}, and the run ends at step"
+        raise DelayRLError(f"{line} {schedule.steps:,}; give more steps, or let it learn more often")
+    if (first := min(firsts, default=0)) > schedule.steps:
         start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
         start += "" if setup.condition.preset == "small" else ", or preset small"
         line = f"nothing would be learned: the first update is at step {first:,}, and the run ends"

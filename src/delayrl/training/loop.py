@@ -42,7 +42,7 @@ def run(group: Group, state: TrainState, note: Callable[[str], None], stopped: C
     """
     steps, ways = group.setup.schedule.steps, group.ways
     if state.step < steps:
-        recorder = Recorder(group, state.learner.agent, state.actors[0].env, ways.track)
+        recorder = Recorder(group, state)
         if ways.progress:
             note(f"estimate: {estimate(group, state)}")
         interval = 0.5 if sys.stderr.isatty() else 30

@@ -12,7 +12,13 @@ from delayrl.run.arrays import Arrays, flatten_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder
 
-RENAMED = (("", "reference."), ("", "delayed."), ("reference.", ""), ("delayed.", ""), ("", ""))
+INNER = ("auxiliary.", "reference.", "delayed.")
+RENAMED = (
+    *(("", inner) for inner in INNER),
+    *((one, other) for one in INNER for other in INNER if one != other),
+    *((inner, "") for inner in INNER),
+    ("", ""),
+)
 """Beginnings of names in another run, and here: agents inside agents. Where two fit as well, the later one counts."""
 
 

@@ -1,5 +1,6 @@
 """Evaluation and metrics of a run in training, written to its run folders."""
 
+from contextlib import ExitStack, closing
 from typing import Any
 
 import jax
@@ -11,32 +12,43 @@ from delayrl.core.types import Metrics, Spec
 from delayrl.envs.making import physics
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import EVALUATION, Evaluator, reset_seed
-from delayrl.training.resume import KEPT
-from delayrl.training.state import Group
+from delayrl.training.state import Group, TrainState
 from delayrl.training.tracking import Tracker
 
 OPENING = 3
 """The stream of an evaluation's opening actions, apart from its start state and its delays (1) and noise (2)."""
 
 
-class Recorder:
-    """Evaluates a group of seeds and writes rows and metrics; to a tracking service too, if `track` names one."""
+KEPT = "the last good checkpoint is kept"
 
-    def __init__(self, group: Group, agent: State, env: Any, track: str | None) -> None:
+
+def evaluators(group: Group, agent: State) -> dict[str, Evaluator]:
+    """Make what plays the evaluations of a group: of the agent, and without delay of its reference, if it has one."""
+    setup = group.setup
+    shape = (len(group.seeds), setup.schedule.evaluation_episodes, group.apply)
+    with ExitStack() as held:
+        made = {"agent": Evaluator(setup.agent, group.spec, setup.task, setup.delay, *shape)}
+        held.enter_context(closing(made["agent"]))
+        if reference := reference_of(setup.agent, agent):
+            spec = Spec(group.spec.obs_size, group.spec.action_size, 0)
+            made["reference"] = Evaluator(reference[0], spec, setup.task, 0, *shape)
+        held.pop_all()
+    return made
+
+
+class Recorder:
+    """Evaluates a group of seeds and writes rows and metrics; to a tracking service too, where the group has one."""
+
+    def __init__(self, group: Group, state: TrainState) -> None:
         self._group = group
         setup = group.setup
         self._columns = setup.condition.columns | {
             "privileged": setup.agent.privileged,
             "configuration": setup.configuration,
         }
-        self._physics = physics(env)
-        self._trackers = [Tracker(track, run.path) for run in group.folders]
-        task, delay = setup.task, setup.delay
-        shape = (len(group.seeds), setup.schedule.evaluation_episodes, group.apply)
-        self._evaluators = {"agent": Evaluator(setup.agent, group.spec, task, delay, *shape)}
-        if reference := reference_of(setup.agent, agent):
-            spec = Spec(group.spec.obs_size, group.spec.action_size, 0)
-            self._evaluators["reference"] = Evaluator(reference[0], spec, task, 0, *shape)
+        self._physics = physics(state.actors[0].env)
+        self._evaluators = evaluators(group, state.learner.agent)
+        self._trackers = [Tracker(group.ways.track, run.path, state.step) for run in group.folders]
 
     def evaluate(self, step: int, agent: State) -> str:
         """Play the evaluation episodes of a step, write a row for each. Returns the mean returns in words."""
@@ -76,9 +88,11 @@ class Recorder:
         return " · ".join(summary)
 
     def close(self) -> None:
-        """Close the environments of the evaluations."""
+        """Close the environments of the evaluations, and what is open of a tracking service."""
         for evaluator in self._evaluators.values():
             evaluator.close()
+        for tracker in self._trackers:
+            tracker.close()
 
     def episodes(self, ended: list[list[dict[str, Any]]]) -> None:
         """Write a row for each episode of training that ended, [seeds][episodes], and empty the lists."""

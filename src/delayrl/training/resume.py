@@ -23,12 +23,12 @@ from delayrl.training.actor import Actor
 from delayrl.training.cost import cost_of
 from delayrl.training.learner import Learner, Stored
 from delayrl.training.origin import taken_over
+from delayrl.training.recorder import KEPT, evaluators
 from delayrl.training.state import Group, TrainState
 
 COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
 """The columns of a replay that have one entry for each row."""
 COUNTS = ("rows", "steps", "lost")
-KEPT = "the last good checkpoint is kept"
 
 
 def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
@@ -46,14 +46,16 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
             raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
     checkpoints = [] if replaced else _common_checkpoints(group, note)
     state = restore(group, actors, checkpoints) if checkpoints else _fresh(group, actors, note)
-    for run in replaced:  # now that nothing can be refused any more
-        run.remove()
     config |= {"configuration": group.setup.configuration}
     used = versions()
-    new = [run for run in runs if not run.exists]
-    longer = [run for run in runs if run.exists and run.config["schedule"]["steps"] != group.setup.schedule.steps]
+    new = [run for run in runs if run in replaced or not run.exists]
+    longer = [run for run in runs if run not in new and run.config["schedule"]["steps"] != group.setup.schedule.steps]
     if new or longer:
         config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
+    for evaluator in evaluators(group, state.learner.agent).values() if replaced else []:
+        evaluator.close()  # there could be too many environments
+    for run in replaced:  # now that nothing can be refused any more
+        run.remove()
     for run, seed in zip(runs, group.seeds, strict=True):
         if run in new:
             run.create(config | {"versions": used, "seed": seed})

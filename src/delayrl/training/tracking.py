@@ -1,5 +1,6 @@
 """Optional logging of scalars to TensorBoard or Weights & Biases. The run folder always has them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,19 +9,22 @@ SERVICES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
 class Tracker:
-    """Writes scalars to one service; with `kind` None to nowhere."""
+    """Writes scalars to one service from a step on; with `kind` None to nowhere."""
 
-    def __init__(self, kind: str | None, path: Path):
+    def __init__(self, kind: str | None, path: Path, step: int):
         self._write: Any = None
+        self.close: Callable[[], object] = lambda: None
         if kind == "tensorboard":
             from tensorboardX import SummaryWriter
 
-            writer = SummaryWriter(str(path / "tensorboard"))
+            writer = SummaryWriter(str(path / "tensorboard"), purge_step=step)  # a stopped run may have been further
+            self.close = writer.close
             self._write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
         elif kind == "wandb":
             import wandb
 
             run = wandb.init(project="delayrl", name=str(path), dir=str(path), reinit="create_new")
+            self.close = run.finish
             self._write = lambda step, values: run.log(values, step=step)
 
     def write(self, step: int, values: dict[str, float]) -> None:

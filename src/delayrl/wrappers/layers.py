@@ -50,11 +50,11 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
 
 
 def limit_of(env: Any) -> int | None:
-    """Return the time limit of an environment in steps, from its spec or a `TimeLimit` around it; None without one."""
+    """Return the time limit of an environment in steps, the least of its spec's and its layers'; None without one."""
+    limits = [layer._max_episode_steps for layer in layers_of(env) if isinstance(layer, TimeLimit)]
     if env.spec is not None and env.spec.max_episode_steps is not None:
-        return int(env.spec.max_episode_steps)
-    limits = (layer._max_episode_steps for layer in layers_of(env) if isinstance(layer, TimeLimit))
-    return next(limits, None)  # of an environment that was not made by an id, and has no spec
+        limits.append(env.spec.max_episode_steps)
+    return min(map(int, limits), default=None)
 
 
 def check_limit(env: Any, name: str) -> None:

@@ -16,6 +16,9 @@ OURS = ("age", "actions", "mask", "truth", "observation_age", "applied")  # what
 INSIDE = "the whole delay inside, gymnasium.make_vec(..., wrappers=[lambda env: Delayed(env, '2+reward=3')])"
 
 
+TWICE = f"the environments are delayed already: give one delay, here '2+action=1', or {INSIDE}"
+
+
 class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     """Delay every environment of a vector, each with random numbers of its own.
 
@@ -55,9 +58,9 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         super().__init__(env)
         envs = getattr(env.unwrapped, "envs", ())
         if any(max(inner.delay.maximum, inner.delay.reward.maximum) for inner in map(find_delayed, envs) if inner):
-            raise DelayRLError(f"the environments are delayed already: give one delay, here '2+action=1', or {INSIDE}")
-        if step_seconds is None and envs:
-            step_seconds = seconds_of(envs[0])
+            raise DelayRLError(TWICE)
+        if step_seconds is None:
+            step_seconds = seconds_of(envs[0] if envs else env.unwrapped)
         self.delay = as_delay(delay, step_seconds)
         if self.delay.reward.maximum:
             line = "a vector of environments cannot delay rewards, because all environments step together"
@@ -83,6 +86,8 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
                 f"DelayedVector takes and gives NumPy arrays, but the environments give {kind}: convert them inside, "
                 "e.g. with gymnasium.wrappers.vector.ArrayConversion"
             )
+        if {"age", "actions", "mask"} <= infos.keys() and np.size(infos["mask"]):  # a Delayed in processes of their own
+            raise DelayRLError(TWICE)
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         for i in np.flatnonzero(mask):
             self._transits[i].reset(truth[i], seeds[i] if seeds is not None else None)

@@ -441,13 +441,32 @@ class Direction:
 
 def test_what_is_no_policy_is_refused_at_once() -> None:
     """Not at the first command, when the plant waits for it."""
+    one = Direction(2)
+    one.low, one.high = np.full(2, -1.0), np.ones(2)
     with pytest.raises(DelayRLError, match=r"the policy's action must be 2 numbers; got shape \(1,\)"):
-        Controller(Direction(2))
+        Controller(one)
     with pytest.raises(DelayRLError, match=r"a policy also says its obs_size, action_size, low, high, max_age \(see"):
         Controller(np.sin)
     controller = Controller(Direction(1))
     controller.observe([2.0], 0)
     assert controller.act() == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"max_age": 3.0}, "whole number of steps, 0 or more; got 3.0"),
+        ({"max_age": -1}, "got -1"),
+        ({"low": np.zeros(2)}, r"are 1 numbers each.*got \[0.0, 0.0\] and \[2.0\]"),
+        ({"high": np.float32([-3])}, "none of low above"),
+        ({"low": np.float32([np.nan])}, "none of low above"),
+    ],
+)
+def test_what_a_policy_says_of_itself_is_checked(changes: dict, words: str) -> None:
+    policy = Recorder(gym.make("Pendulum-v1"), 3)
+    vars(policy).update(changes)
+    with pytest.raises(DelayRLError, match=words):
+        Controller(policy)
 
 
 def test_a_policy_may_overwrite_its_inputs() -> None:

@@ -87,7 +87,8 @@ def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) ->
         raw = graph("Where", delayed, raw, graph.mlp(current, row))
     unit = graph("Reshape", graph("Tanh", raw), graph.constant([network.action_size], np.int64))
     gained = graph("Mul", graph("Add", unit, graph.constant(1)), graph.constant((high - low) / 2))
-    graph("Add", gained, graph.constant(low), output="action")
+    action = graph("Add", gained, graph.constant(low))
+    graph("Min", action, graph.constant(high), output="action")  # rounding may have brought it beyond
 
     declare, real = helper.make_tensor_value_info, TensorProto.FLOAT
     inputs = [declare("obs", real, [network.obs_size])]

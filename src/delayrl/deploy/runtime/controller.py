@@ -103,8 +103,7 @@ class Controller:
         idle: ArrayLike | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if missing := [name for name in ControlPolicy.__annotations__ if name != "dt" and not hasattr(policy, name)]:
-            raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}")
+        _check(policy)
         if on_overrun not in get_args(OnOverrun):
             raise DelayRLError(f"on_overrun is hold, clip or raise; got {on_overrun!r}")
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
@@ -258,6 +257,18 @@ def _decide(policy: ControlPolicy, obs: NDArray[Any], actions: Sequence[Action],
     if age:
         shown[:age] = actions[:age]
     return _in_range(policy, _action(policy, policy(obs, shown, age), "the policy's action"))
+
+
+def _check(policy: ControlPolicy) -> None:
+    """Raise DelayRLError if a policy does not say of itself what a `ControlPolicy` does."""
+    if missing := [name for name in ControlPolicy.__annotations__ if name != "dt" and not hasattr(policy, name)]:
+        raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}")
+    if not isinstance(policy.max_age, int | np.integer) or policy.max_age < 0:
+        raise DelayRLError(f"the policy's max_age is a whole number of steps, 0 or more; got {policy.max_age!r:.80}")
+    low, high = _numbers(policy.low, np.float64), _numbers(policy.high, np.float64)
+    if not low.shape == high.shape == (policy.action_size,) or not (low <= high).all():
+        line = f"the policy's low and high are {policy.action_size} numbers each, none of low above that of high"
+        raise DelayRLError(f"{line}; got {low.tolist()} and {high.tolist()}")
 
 
 def _in_range(policy: ControlPolicy, action: Action) -> Action:
