@@ -1,5 +1,7 @@
 """What an evaluation plays, and what its rows say."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +19,7 @@ from delayrl.run.condition import resolve
 from delayrl.training import recorder
 from delayrl.training.recorder import Recorder
 from delayrl.training.state import Ways
+from delayrl.training.tracking import Tracker
 
 STATE = Random().init(Spec(2, 1, 2), jax.random.key(0))
 SEEDS, RETURNS, LENGTHS = [5, 6], np.array([[1.0, 2.0], [4.0, 8.0]]), np.array([[7, 6], [5, 4]])
@@ -83,3 +86,21 @@ def test_official_evaluation_has_the_runs_start_state(played: Any) -> None:
 def test_what_is_not_finite_is_not_written(played: Any) -> None:
     with pytest.raises(DelayRLError, match="q is nan at step 1000 of seed 6: training diverged"):
         played.started("corrected").log(1000, {"q": np.array([1.0, np.nan])}, 5.0)
+
+
+def test_tensorboard_goes_on_where_the_run_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stopped run had logged after its checkpoint is not shown; the file is closed with the run."""
+    done = []
+
+    def writer(folder: str, purge_step: int) -> Any:
+        done.append((folder, purge_step))
+        return SimpleNamespace(add_scalar=lambda *values: done.append(values), close=lambda: done.append("closed"))
+
+    monkeypatch.setitem(sys.modules, "tensorboardX", SimpleNamespace(SummaryWriter=writer))
+    tracker = Tracker("tensorboard", tmp_path, 300)
+    tracker.write(400, {"return/agent": 1.5})
+    tracker.close()
+    assert done == [(str(tmp_path / "tensorboard"), 300), ("return/agent", 1.5, 400), "closed"]
+    nothing = Tracker(None, tmp_path, 0)
+    nothing.write(400, {"return/agent": 1.5})
+    nothing.close()
