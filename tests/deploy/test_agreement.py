@@ -92,6 +92,22 @@ def test_backends_agree(name: str, tmp_path: Path, request: pytest.FixtureReques
     np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
 
 
+def test_no_rounding_brings_an_action_beyond_its_bounds(tmp_path: Path, controller: str) -> None:
+    """Of a saturated policy low + 2 (high - low) / 2 is above high in float32 for a sixth of all ranges."""
+    low, high = np.sort(np.random.default_rng(0).uniform(-3, 3, (2, 1000)).astype(np.float32), 0)
+    beyond = low + 2 * ((high - low) / np.float32(2)) > high
+    bounds = low[beyond][:2], high[beyond][:2]
+    usual = policy_of("bpql")
+    policy = Policy(usual.agent, usual.state, usual.spec, *bounds)
+    last = policy.state.actor[-1]
+    last["b"] = np.full_like(last["b"], 1e6)
+    path = bundle_of(tmp_path / "bundle", policy)
+    inputs = random_inputs(policy, [1])
+    onnx = onnx_policy(*network_of(policy))
+    assert (onnx(*inputs[0]) == bounds[1]).all()
+    assert (ask(controller, path, inputs).astype(np.float32) == bounds[1]).all()
+
+
 def test_numbers_so_large_that_there_is_no_action(tmp_path: Path, controller: str) -> None:
     """Each is finite, but not their sum: a NaN would be sent to the drives."""
     policy = policy_of("bpql")

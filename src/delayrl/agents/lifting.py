@@ -47,9 +47,7 @@ class Lifting:
 
     bpql: sac.SAC = field(default_factory=lambda: replace(sac.BPQL, initial_temperature=0.2))
     lifting_weight: Annotated[float, "initial weight of the lifting loss", (0.0, 1e6)] = 10.0
-    lifting_hold: Annotated[int, "environment step until which the weight is constant", "scales", (0, math.inf)] = (
-        250_000
-    )
+    lifting_hold: Annotated[int, "environment step up to which the weight stays", "scales", (0, math.inf)] = 250_000
     lifting_end: Annotated[int, "environment step at which the weight, falling linearly, reaches 0", "scales"] = 750_000
 
     privileged = False

@@ -183,15 +183,13 @@ def _from_stamps(
         row = int(np.argmin(delays))
         hint = "the clocks differ by at least that; synchronise them (PTP, NTP), or stamp both ends with one clock"
         raise DelayRLError(f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made: {hint}")
-    first = np.append(
-        True, ~inside | (gaps > 0)
-    )  # a row of the control loop may show the observation of the row before
+    # a row of the control loop may show the observation of the row before
+    first = np.append(True, ~inside | (gaps > 0))
     if first.sum() < 10:
         raise DelayRLError(f"{path} has {first.sum()} different stamps: too short, at least 10 are needed")
     row_spacing = float(np.median(gaps[inside & (gaps > 0)]))
-    pause = (
-        2 * reading.GAP * row_spacing
-    )  # each recording begins this long after the one before, whatever its clock says
+    # each recording begins this long after the one before, whatever its clock says
+    pause = 2 * reading.GAP * row_spacing
     start = np.append(0.0, np.cumsum(np.where(inside, gaps, pause)))[first]
     made, delays = made[0] + start, delays[first]
     warm = WARM_UP * float(start[-1]) if warm_up is None else warm_up
