@@ -23,9 +23,10 @@ CASES: tuple[Case, ...] = (
     ("HalfCheetah-v5", 50),
     ("delayrl/Pusher-v4", 25),
     ("delayrl/Pusher-v4", 50),
+    ("InvertedDoublePendulum-v5", 5),
 )
 """Task and delay of each column, and of each panel of the picture; the second decides the order of the rows."""
-STEPS = {"HalfCheetah-v5": 100_000, "delayrl/Pusher-v4": 40_000}
+STEPS = {"HalfCheetah-v5": 100_000, "delayrl/Pusher-v4": 40_000, "InvertedDoublePendulum-v5": 30_000}
 SEEDS = 5
 COLOURS = {
     "`sac`, no delay": "#8c8c8c",
@@ -46,7 +47,8 @@ def section(files: list[Path], pictures: Path) -> str:
     chosen = choose(results_of(tables))
     draw(chosen, pictures / "result.png")
     used = [versions for file in files for versions in trained_with(file)]
-    steps = " and ".join(f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
+    *others, last = (f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
+    steps = f"{', '.join(others)} and {last}"
     made = f"Δ is the delay in steps. Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other "
     made += (
         "number is given. In brackets is the 95 % interval of the mean, below it the return at the end, ± the standard "
@@ -113,18 +115,16 @@ def cell(result: Result | None) -> str:
 
 def draw(chosen: Chosen, out: Path) -> None:
     """Draw a panel of curves for each case."""
-    figure, panels = pyplot.subplots(2, 3, figsize=(10, 6.2), layout="constrained")
-    *panels, beside = panels.flat
+    figure, panels = pyplot.subplots(2, 3, figsize=(10, 6.8), layout="constrained")
     lines = {}
-    for axes, case in zip(panels, CASES, strict=True):
+    for axes, case in zip(panels.flat, CASES, strict=True):
         for label, colour in COLOURS.items():
             if (label, case) in chosen:
                 lines[label] = curve(axes, *chosen[label, case].curves, colour)
-        axes.set_title(f"{short(case[0])}, {case[1]} steps late")
+        axes.set_title(f"{short(case[0])}, {case[1]} steps late", fontsize=9)
         axes.locator_params(axis="x", nbins=4)
     labels = [label for label in COLOURS if label in lines]
     names = [label.replace("`", "") for label in labels]
-    beside.axis("off")
-    beside.legend([lines[label] for label in labels], names, loc="center left", frameon=False)
+    figure.legend([lines[label] for label in labels], names, loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)
