@@ -53,8 +53,12 @@ def draw(summary: Summary, out: Path) -> Mapping[tuple[Setting, str], list[str]]
             name = f"curves-{number}-{index}.png"
             _curves([r for r in learners if r.place.delay == delay], delay, looks, out / name)
             files[setting, "curves"].append(name)
-        constant = [r for r in learners if isinstance(r.place.delay, int)]
-        if len({r.place.delay for r in constant}) > 1:
+        delays_of: dict[str, set[int]] = defaultdict(set)
+        for result in learners:
+            if isinstance(result.place.delay, int):
+                delays_of[result.place.env].add(result.place.delay)
+        constant = [r for r in learners if r.place.delay in delays_of[r.place.env] and len(delays_of[r.place.env]) > 1]
+        if constant:
             files[setting, "delay"].append(f"delay-{number}.png")
             _against_delay(constant, looks, out / f"delay-{number}.png")
         aggregates = [a for a in summary.aggregates if a.setting == setting]
@@ -91,7 +95,8 @@ def _save(figure: Any, path: Path) -> None:
     for panel in figure.axes:
         lines |= {label: line for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     names = sorted(lines, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
-    figure.legend([lines[key] for key in names], names, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    look = {"loc": "outside lower center", "ncols": min(5, int(figure.get_figwidth() / 2)), "frameon": False}
+    figure.legend([lines[key] for key in names], names, fontsize=9, **look)
     figure.savefig(path, dpi=110)
 
 
