@@ -54,12 +54,14 @@ def episodes(table: Collected) -> dict[Policy, Runs]:
     DelayRLError if a seed of a policy is there twice.
     """
     cells = {cell.id: cell.condition for cell, _ in table.standing if budget(cell.condition)}
-    late = {arm(cells[cell.id]) for cell, progress in table.standing if cell.id in cells and progress.state != "done"}
+    late = {
+        policy_of(cells[cell.id]) for cell, progress in table.standing if cell.id in cells and progress.state != "done"
+    }
     known: dict[Policy, Runs] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     cell_of: dict[tuple[Policy, int], str] = {}
     for row in table.rows:
         condition = cells.get(row["cell"])
-        if condition is None or arm(condition) in late:
+        if condition is None or policy_of(condition) in late:
             continue
         words = CHANCE if condition.agent == CHANCE else in_words(condition, row["privileged"])
         if words == CHANCE or words in COLOURS:
@@ -77,7 +79,7 @@ def budget(condition: Condition) -> bool:
     return long and condition.env == ENV and isinstance(condition.delay, int)
 
 
-def arm(condition: Condition) -> tuple[int | str, str]:
+def policy_of(condition: Condition) -> tuple[int | str, str]:
     """Return what all cells of a policy share."""
     return condition.delay, in_words(condition, privileged=False)
 

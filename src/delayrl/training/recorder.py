@@ -17,8 +17,6 @@ from delayrl.training.tracking import Tracker
 
 OPENING = 3
 """The stream of an evaluation's opening actions, apart from its start state and its delays (1) and noise (2)."""
-
-
 KEPT = "the last good checkpoint is kept"
 
 

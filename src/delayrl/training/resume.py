@@ -52,8 +52,9 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     longer = [run for run in runs if run not in new and run.config["schedule"]["steps"] != group.setup.schedule.steps]
     if new or longer:
         config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
-    for evaluator in evaluators(group, state.learner.agent).values() if replaced else []:
-        evaluator.close()  # there could be too many environments
+    if replaced:  # evaluations may need more environments than can be made
+        for evaluator in evaluators(group, state.learner.agent).values():
+            evaluator.close()
     for run in replaced:  # now that nothing can be refused any more
         run.remove()
     for run, seed in zip(runs, group.seeds, strict=True):
