@@ -1,6 +1,6 @@
 """PPO of brax under a delay: without knowledge of it, with the augmented state, and with a value of the true state.
 
-    pip install 'delayrl[brax]' matplotlib
+    pip install -e '.[brax]' matplotlib
     python examples/ppo_brax.py --task inverted_pendulum --delay 4 --seeds 0 1 2 --out ppo
 
 `blind` sees the late observation alone, `augmented` also the actions since, and `privileged` gives its value function

@@ -52,6 +52,7 @@ class Shrink:
 WIDE = Shrink(width=16)
 DELAYED = Shrink(sees="delayed")  # `sees` is no option, so the class and the options do not make it again
 ENTRY = Registration("Shrinks, with presets.", "Nobody, 2026", {"tiny": Preset(Shrink(width=2), Schedule(steps=120))})
+BARE = Registration("Has nothing to train with.", "-", {})
 
 
 @dataclass(frozen=True)

@@ -78,9 +78,18 @@ def test_an_instance_and_presets_by_name(tmp_path: Path) -> None:
     assert resolve("own_agents:ENTRY", make_arm, 3, "tiny", "corrected", {}).schedule.steps == 120
     with pytest.raises(DelayRLError, match="unknown preset 'small' of own_agents:ENTRY; there are tiny"):
         resolve("own_agents:ENTRY", make_arm, 3, "small", "corrected", {})
+    with pytest.raises(DelayRLError, match="own_agents:BARE has no preset"):
+        find_agent("own_agents:BARE")
     usual, small = find_agent("own_agents:WIDE").presets["matched"], AGENTS["bpql"].presets["small"]
     assert usual == (own_agents.WIDE, AGENTS["bpql"].presets["matched"].schedule)
     assert find_agent("own_agents:WIDE").presets["small"].schedule == small.schedule
+
+
+def test_the_command_line_takes_a_preset_that_there_is(capsys) -> None:
+    """Without `paper` among an agent's presets, its first is the default."""
+    with pytest.raises(SystemExit):
+        main(["train", "own_agents:ENTRY", "--help"])
+    assert "(default: tiny)" in capsys.readouterr().out
 
 
 def test_an_agent_without_a_name_is_given_again(tmp_path: Path, capsys) -> None:

@@ -8,7 +8,7 @@ teaches all of them. π(x^(d)_t) may be pulled towards a younger π(x^(j)_t), wi
 Views: the actor sees a forecast from x_t, at its own and at a second age; the critics see s_t. Unprivileged: s_t and
 the observations in between are learned from once they have arrived.
 
-What it takes from whom stands in docs/algorithms/any-age.md.
+Its skeleton is `pred_detach` of Wang et al., ICLR 2024; docs/algorithms/any-age.md says what it takes from whom.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""The random policy: uniform actions. Its return is the lower anchor of normalised returns (VDPO §5: Ret_rand)."""
+"""The random policy: uniform actions. Its return is the lower anchor of normalised returns (VDPO §4.2.2: Ret_rand)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -77,7 +78,10 @@ def run(given: argparse.Namespace) -> None:
 
 
 def _steps_or_seconds(text: str) -> int | float:
-    return int(text) if text.isdecimal() else seconds(text)
+    for read in (whole, seconds):
+        with suppress(argparse.ArgumentTypeError):
+            return read(text)
+    raise argparse.ArgumentTypeError(f"must be a number of steps, or a time such as 20ms or 0.02s; got {text!r}")
 
 
 def _show_environment(p: Probed) -> str:
@@ -99,7 +103,8 @@ def _show_environment(p: Probed) -> str:
         lines.append(f"Components of the observation react at the earliest: {each}.")
     if p.maximum:
         actions = _plural(p.maximum, "action")
-        lines += ["", f"An agent must remember {actions}. The delay is in there already: add none."]
+        lines += ["", f"An agent must remember {actions}. This environment delays by itself, which no option counts:"]
+        lines.append("to train, take its delay out and give it as --delay.")
     return "\n".join(lines)
 
 

@@ -33,7 +33,8 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary
     parser.allow_abbrev = False
     first = Parser(prog=parser.prog, add_help=False)
-    first.add_argument("--preset", choices=list(agent.presets), default="paper")
+    usual = "paper" if "paper" in agent.presets else next(iter(agent.presets))
+    first.add_argument("--preset", choices=list(agent.presets), default=usual)
     preset = first.parse_known_args(words)[0].preset
 
     add = parser.add_argument
@@ -42,7 +43,7 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     add_env_kwargs(parser)
     add_wrappers(parser)
     add("--delay", default="0", metavar="DELAY", help="steps, or e.g. 80ms, uniform:1:5 (default: 0)")
-    add("--preset", choices=list(agent.presets), default="paper", help="the defaults of the options (default: paper)")
+    add("--preset", choices=list(agent.presets), default=usual, help=f"the defaults of the options (default: {usual})")
     add("--seed", type=whole, default=0, metavar="K", help="fixes everything (default: 0)")
     add("--seeds", type=whole, default=1, metavar="N", help="train seeds K..K+N-1 in lockstep (default: 1)")
     add("--out", type=Path, metavar="DIR", help="the run folder (default: below runs/)")

@@ -56,8 +56,8 @@ class Channel:
 
 
 PAPER_STOCHASTIC_5 = Channel(laws.Choice((1, 2, 3, 4, 5), (0.02, 0.02, 0.02, 0.02, 0.92)), "raw")
-"""VDPO's stochastic delay of observations, §5.3: "Δ = 5 with probability 0.9 and Δ in [1, 5] with probability 0.1", so
-5 with 0.92. The paper does not say how it is drawn. Here each step draws anew, and the age is known."""
+"""VDPO's stochastic delay of observations, §4.2.3: "Δ = 5 with probability 0.9 and Δ in [1, 5] with probability 0.1",
+so 5 with 0.92. The paper does not say how it is drawn. Here each step draws anew, and the age is known."""
 PRESETS = {"paper-stochastic-5": PAPER_STOCHASTIC_5}
 CHANNELS = ("observation", "action", "reward")
 

@@ -75,6 +75,8 @@ def find_agent(name: str, stored: Path | None = None) -> Registration:
         raise DelayRLError(f"{stored} came with {what}: if you mean it, give it as agent")
     found = find_object(source)
     if isinstance(found, Registration):
+        if not found.presets:
+            raise DelayRLError(f"{name} has no preset: give its Registration one, as docs/own-agent.md shows")
         for preset in found.presets.values():
             _checked(preset.agent, name)
         return found
