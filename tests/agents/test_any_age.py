@@ -162,6 +162,7 @@ def test_a_sequence_without_a_delay_is_sac() -> None:
 
 
 FORECASTING = replace(AGENT, encoder="forecast")
+VALUED = replace(FORECASTING, forecast_learns_from="states+values")
 
 
 def away_from_start(spec: Spec) -> networks.Params:
@@ -191,7 +192,7 @@ def test_a_forecast_by_hand(rng: np.random.Generator) -> None:
 
 
 def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator) -> None:
-    """Its error is in deviations, which follow the changes; the values of actions do not move it."""
+    """Its error is in deviations, which follow the changes; the values of actions move it only where asked to."""
     actor = away_from_start(Spec(OBS, ACT, 3))
     x = views_of(rng, (2, 6))
     state = jnp.asarray(rng.normal(size=(2, 6, OBS)), jnp.float32)
@@ -200,12 +201,27 @@ def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator)
     error[:, ::2] = 0  # nothing is forecast at age 0
     np.testing.assert_allclose(forecast_loss(actor, x, state), (error**2).mean(), rtol=1e-5)
     learned = jax.grad(forecast_loss)(actor, x, state)
-    valued = jax.grad(lambda actor: (forecasting(actor, x) ** 2).mean())(actor)
-    for gradient, moved in ((learned, {"forecast"}), (valued, {"policy"})):
+    valued, both = (
+        jax.grad(lambda actor, network=network: (network(actor, x) ** 2).mean())(actor)
+        for network in (FORECASTING.learner.actor_network, VALUED.learner.actor_network)
+    )
+    for gradient, moved in ((learned, {"forecast"}), (valued, {"policy"}), (both, {"policy", "forecast"})):
         parts = {name: jax.tree.leaves(part) for name, part in gradient.items()}
         assert {name for name, leaves in parts.items() if any(jnp.abs(leaf).max() > 0 for leaf in leaves)} == moved
     square = 0.99 * np.asarray(actor["deviation"]) ** 2 + 0.01 * (change**2).mean((0, 1))
     np.testing.assert_allclose(follow_changes(actor, x, state)["deviation"], np.sqrt(square), rtol=1e-4)
+
+
+def test_values_may_move_the_forecast(rng: np.random.Generator) -> None:
+    """Then an update differs in the forecast alone, and only after its first step in what the policy reads."""
+    state = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
+    windows = random_windows(Spec(OBS, ACT, 3))
+    alone, both = (a.update(state, windows, jax.random.key(1), jnp.int32(4))[0] for a in (FORECASTING, VALUED))
+    for a, b in zip(jax.tree.leaves(alone.actor["policy"]), jax.tree.leaves(both.actor["policy"]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(alone.actor["forecast"][0]["w"], both.actor["forecast"][0]["w"], atol=1e-5)
+    with pytest.raises(DelayRLError, match="forecast_learns_from needs encoder=forecast; with mlp give states"):
+        replace(VALUED, encoder="mlp").for_run(Schedule())
 
 
 @pytest.mark.parametrize("pulled", [True, False])

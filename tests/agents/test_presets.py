@@ -14,6 +14,7 @@ ANY_AGE = {
     "pull_hold": 0.25,
     "pull_end": 0.75,
     "encoder": "forecast",
+    "forecast_learns_from": "states",
     "encoder_width": 64,
     "encoder_layers": 2,
     "belief_weight": 0.0,

@@ -61,6 +61,7 @@ def ends(runs: Path, file: Path) -> list[int]:
     return [sum(e["event"] == "done" for e in folders.journal(runs / cell.folder)) for cell in cells]
 
 
+@pytest.mark.thorough
 def test_workers_killed(undisturbed, tmp_path: Path) -> None:
     """Every cell ends once, with the rows and parameters of the undisturbed grid."""
     file, expected = undisturbed

@@ -120,6 +120,7 @@ def test_actor_climbs_the_folded_critic(windows: Window) -> None:
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_it_trains_as_any_age_with_other_critics(tmp_path: Path) -> None:
     plain = delayrl.agents.registry.AGENTS["any-age"].presets["matched"].agent
     agent = crossq.ANY_AGE.presets["matched"].agent

@@ -115,6 +115,7 @@ def column(view: Any, table: str, index: int) -> list[str]:
     return [text.strip() for text in view.locator(f"#{table} tbody tr td:nth-child({index + 1})").all_inner_texts()]
 
 
+@pytest.mark.thorough
 def test_page_sorts(opened: Any) -> None:
     view = opened(*sampled())
     heads = view.locator("#all thead th").all_inner_texts()
@@ -150,6 +151,7 @@ def test_page_rounds_once(opened: Any) -> None:
     assert "3,406 ± 0" in view.locator("#all").inner_text()
 
 
+@pytest.mark.thorough
 def test_page_filters(opened: Any) -> None:
     view = opened(*sampled())
     assert set(column(view, "all", 0)) == {"delayrl/Ant-v4", "delayrl/Hopper-v4"}
@@ -167,6 +169,7 @@ def test_page_filters(opened: Any) -> None:
     assert set(column(view, "all", 0)) == {"delayrl/Ant-v4", "delayrl/Hopper-v4"}
 
 
+@pytest.mark.thorough
 def test_page_compares_each_two_agents(opened: Any) -> None:
     cells, every = sampled()
     view, shown = opened(cells, every), payload(summarise(every, cells), "")
@@ -196,6 +199,7 @@ def test_page_draws_curves_and_shows_values(opened: Any) -> None:
     assert view.locator("#curves polyline").count() > 3 * view.locator("#curves polyline.curve").count()
 
 
+@pytest.mark.thorough
 def test_page_marks_what_goes_on(opened: Any) -> None:
     view = opened(*sampled())
     states = column(view, "all", 12)
@@ -218,6 +222,7 @@ def test_page_in_light_and_dark(opened: Any, tmp_path: Path) -> None:
     assert view.evaluate("getComputedStyle(document.body).backgroundColor") == grounds[0] != grounds[1]
 
 
+@pytest.mark.thorough
 def test_page_on_a_phone(opened: Any) -> None:
     view = opened(*sampled(), viewport={"width": 390, "height": 800})
     assert view.evaluate("document.documentElement.scrollWidth") <= 390  # tables scroll, the page does not

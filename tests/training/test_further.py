@@ -243,6 +243,7 @@ def test_networks_of_another_run(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert len({row["configuration"] for row in new.rows()}) == 1
 
 
+@pytest.mark.thorough
 def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = train("sac", tmp_path / "sac", steps=200)
     new = train("vdpo", tmp_path / "vdpo", steps=100, start_from=old.path, progress=True)
@@ -255,6 +256,7 @@ def test_a_reference_begins_as_a_delay_free_run_ended(tmp_path: Path, capsys: py
         train("dcac", tmp_path / "dcac", start_from=old.path)
 
 
+@pytest.mark.thorough
 def test_normalised_networks_come_with_their_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Also as a reference; moments alone are nothing to begin with."""
     old = train("sac", tmp_path / "sac", steps=200, observation_norm="running")
@@ -267,6 +269,7 @@ def test_normalised_networks_come_with_their_moments(tmp_path: Path, capsys: pyt
         train("sac", tmp_path / "plain", start_from=old)
 
 
+@pytest.mark.thorough
 def test_a_block_that_was_cut_does_not_go_on(tmp_path: Path) -> None:
     run = train("bpql", tmp_path / "run", steps=200, updates_per_call=3, evaluate_every=150)
     with pytest.raises(delayrl.DelayRLError, match="ended within a block of updates_per_call = 3 steps; --from"):

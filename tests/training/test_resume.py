@@ -121,7 +121,12 @@ def test_sigkill_at_random_moments(agent: str, trial: int, tmp_path: Path, whole
     [
         ("bpql", 260, {"protocol": "official"}),
         ("bpql", 237, {"precision": "bfloat16", "hidden": [FEW, FEW]}),
-        *((agent, 237, {}) for agent in AGENTS),
+        *((agent, 237, {}) for agent in ("any-age", "vdpo")),
+        *(
+            pytest.param(agent, 237, {}, marks=pytest.mark.thorough)
+            for agent in AGENTS
+            if agent not in ("any-age", "vdpo")
+        ),
     ],
 )
 def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict, tmp_path: Path, monkeypatch) -> None:

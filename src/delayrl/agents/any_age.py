@@ -25,7 +25,7 @@ from delayrl.agents.base import Deterministic, Phase, Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
-from delayrl.core.forecast import follow_changes, forecast_init, forecast_loss, forecasting, in_task_units
+from delayrl.core.forecast import follow_changes, forecast_init, forecast_loss, forecasting, held, in_task_units
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import annealed, gaussian_kl, masked_mean
 from delayrl.core.sequence import sequence, sequence_init, tokens
@@ -36,6 +36,7 @@ from delayrl.errors import DelayRLError
 SecondAge = Literal["none", "random", "any", "zero"]
 Pull = Literal["moments", "kl"]
 Encoder = Literal["mlp", "forecast", "transformer"]
+LearnsFrom = Literal["states", "states+values"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class AnyAge:
     pull_hold: Annotated[float, "part of the run in which the pull's weight stays constant", (0.0, 1.0)] = 0.25
     pull_end: Annotated[float, "part of the run after which the pull's weight is 0", (0.0, 1.0)] = 0.75
     encoder: Annotated[Encoder, "how the actor reads x_t: flat, by a forecast of s_t, or as a sequence"] = "forecast"
+    forecast_learns_from: Annotated[LearnsFrom, "the states alone, or also the values of actions"] = "states"
     encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
     encoder_layers: Annotated[int, "transformer blocks"] = 2
     belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
@@ -76,6 +78,8 @@ class AnyAge:
             raise DelayRLError("pull_weight needs a younger second_age to pull towards, random or zero; else give 0")
         if self.belief_weight and (self.encoder != "transformer" or self.second_age == "none"):
             raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
+        if self.forecast_learns_from != "states" and self.encoder != "forecast":
+            raise DelayRLError(f"forecast_learns_from needs encoder=forecast; with {self.encoder} give states")
         return replace(self, run_steps=schedule.steps)
 
     def init(self, spec: Spec, key: Key) -> State:
@@ -109,7 +113,7 @@ class AnyAge:
     @property
     def learner(self) -> sac.SAC:
         """BPQL with an actor of any encoder."""
-        return replace(self.bpql, actor_network=encoded)
+        return replace(self.bpql, actor_network=encoded if self.forecast_learns_from == "states" else encoded_as_one)
 
     def update(self, state: State, windows: Window, key: Key, count: Int[Array, ""]) -> tuple[State, Metrics]:
         """Update the critics as BPQL does, and the actor at its own and a second age."""
@@ -179,6 +183,11 @@ class AnyAge:
 
 
 def encoded(actor: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
+    """Apply an actor of any encoder, whose forecast no value moves."""
+    return encoded_as_one(held(actor) if "forecast" in actor else actor, x)
+
+
+def encoded_as_one(actor: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
     """Apply an actor of any encoder; without a delay it is an `mlp`, which is a list."""
     if isinstance(actor, list):
         return networks.mlp(actor, x)

@@ -27,13 +27,18 @@ def forecast_init(key: Key, spec: Spec, hidden: tuple[int, ...], outputs: int) -
 
 def forecast(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch obs"]:
     """Return the forecast of s_t: the observation in x_t plus its forecast change, which is 0 at age 0."""
-    change = params["deviation"] * mlp(params["forecast"], x)
+    change = jax.lax.stop_gradient(params["deviation"]) * mlp(params["forecast"], x)
     return x[..., : change.shape[-1]] + jnp.where(_late(x), change, 0)
 
 
 def forecasting(params: Params, x: Float[Array, "*batch input"]) -> Float[Array, "*batch outputs"]:
-    """Apply the policy's MLP to the forecast of s_t, which it cannot change."""
-    return mlp(params["policy"], jax.lax.stop_gradient(forecast(params, x)))
+    """Apply the policy's MLP to the forecast of s_t."""
+    return mlp(params["policy"], forecast(params, x))
+
+
+def held(params: Params) -> Params:
+    """Return the parameters with a forecast that no gradient moves."""
+    return params | {"forecast": jax.lax.stop_gradient(params["forecast"])}
 
 
 def forecast_loss(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Array:

@@ -13,6 +13,7 @@ OLDER: Mapping[str, Any] = {
     "critic_norm": "none",
     "pull": "moments",
     "encoder": "mlp",
+    "forecast_learns_from": "states",
     "encoder_width": 64,
     "encoder_layers": 2,
     "belief_weight": 0.0,
@@ -86,8 +87,7 @@ def override(config: Any, values: Mapping[str, Any]) -> Any:
     changes: dict[str, Any] = {}
     known = {option.name: option for option in options(config)}
     for field in fields(config):
-        value = getattr(config, field.name)
-        if is_dataclass(value):
+        if is_dataclass(value := getattr(config, field.name)):
             changes[field.name] = override(value, values)
         elif field.name in values and field.name in known:
             changes[field.name] = known[field.name].check(values[field.name])
