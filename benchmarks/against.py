@@ -1,4 +1,4 @@
-"""Any-age beside each other agent and delay on HalfCheetah: the table of differences in docs/algorithms/any-age.md."""
+"""Any-age beside each other agent and delay of a task: the tables of differences in docs/algorithms/any-age.md."""
 
 import re
 from pathlib import Path
@@ -13,25 +13,29 @@ from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result, delay_order
 
 ENV, OWN = "HalfCheetah-v5", "`any-age`"
+VARIANTS = ("`any-age`, `encoder=mlp`", "`any-age`, `forecast_learns_from=states+values`")
+"""Shown beside the arms of the first page."""
 
 
-def section(files: list[Path]) -> str:
-    """Return the table from the cells that have ended, with what its words mean."""
-    results = results_of(map(read_table, files))
-    about = f"{ENV}, preset `matched`, {front.STEPS[ENV]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where "
+def section(files: list[Path], env: str = ENV) -> str:
+    """Return the table of a task from the cells that have ended, with what its words mean."""
+    rows = table(results_of(map(read_table, files)), env)
+    about = f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where "
     about += "no other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are "
     about += (
         "Welch's, of 95 %, and bold where they leave out 0. *Arithmetic* is that of a step of any-age over that of "
     )
-    about += "the other. "
-    return f"{table(results)}\n\n{about}† reads the true state while it trains; VDPO has `--tokens 1280`."
+    about += "the other."
+    if "†" in rows:
+        about += " † reads the true state while it trains; VDPO has `--tokens 1280`."
+    return f"{rows}\n\n{about}"
 
 
-def table(results: list[Result]) -> str:
+def table(results: list[Result], env: str = ENV) -> str:
     """Return a Markdown table: a row for each delay and other agent that has ended on the preset `matched`."""
     chosen: dict[tuple[str, int | str], Result] = {}
-    for result in front.comparable(results):
-        if result.place.env == ENV and result.place.delay != 0:
+    for result in front.comparable(results, VARIANTS):
+        if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
     head = ["delay", "any-age's end", "other agent", "its end", "any-age minus it, at the end", "over training"]
     body = []

@@ -346,6 +346,8 @@ def main() -> None:
         insert(root / "docs" / "algorithms" / "any-age.md", "ages", sweeps.section(ages, "any-age"))
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]
     insert(root / "docs" / "algorithms" / "any-age.md", "against", against.section(rows))
+    poles = against.section(rows, "InvertedDoublePendulum-v5")
+    insert(root / "docs" / "algorithms" / "any-age.md", "against-poles", poles)
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)

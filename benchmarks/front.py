@@ -1,5 +1,6 @@
 """The result on the first page: what each method is worth, from the cells of `evidence-1` and `-2` that have ended."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -70,10 +71,10 @@ def choose(results: list[Result]) -> Chosen:
     return chosen
 
 
-def comparable(results: list[Result]) -> list[Result]:
-    """Return the results of the arms here, at the preset and budget of their task, those with most seeds last."""
+def comparable(results: list[Result], more: Collection[str] = ()) -> list[Result]:
+    """Return the results of the arms here and of `more`, at the budget of their task, those with most seeds last."""
     alike = [r for r in results if r.condition.preset == "matched" and r.condition.steps == STEPS.get(r.place.env)]
-    return sorted((r for r in alike if ended(r) and name(r) in COLOURS), key=lambda r: r.runs)
+    return sorted((r for r in alike if ended(r) and name(r) in {*COLOURS, *more}), key=lambda r: r.runs)
 
 
 def short(env: str) -> str:
