@@ -220,7 +220,7 @@ def test_values_may_move_the_forecast(rng: np.random.Generator) -> None:
     for a, b in zip(jax.tree.leaves(alone.actor["policy"]), jax.tree.leaves(both.actor["policy"]), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
     assert not np.allclose(alone.actor["forecast"][0]["w"], both.actor["forecast"][0]["w"], atol=1e-5)
-    with pytest.raises(DelayRLError, match="forecast_learns_from needs encoder=forecast; with mlp give states"):
+    with pytest.raises(DelayRLError, match=r"forecast_learns_from=states\+values needs encoder=forecast; got mlp"):
         replace(VALUED, encoder="mlp").for_run(Schedule())
 
 

@@ -54,7 +54,7 @@ class AnyAge:
     pull_hold: Annotated[float, "part of the run in which the pull's weight stays constant", (0.0, 1.0)] = 0.25
     pull_end: Annotated[float, "part of the run after which the pull's weight is 0", (0.0, 1.0)] = 0.75
     encoder: Annotated[Encoder, "how the actor reads x_t: flat, by a forecast of s_t, or as a sequence"] = "forecast"
-    forecast_learns_from: Annotated[LearnsFrom, "the states alone, or also the values of actions"] = "states"
+    forecast_learns_from: Annotated[LearnsFrom, "what moves the forecast: states, or also values of actions"] = "states"
     encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
     encoder_layers: Annotated[int, "transformer blocks"] = 2
     belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
@@ -79,7 +79,7 @@ class AnyAge:
         if self.belief_weight and (self.encoder != "transformer" or self.second_age == "none"):
             raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
         if self.forecast_learns_from != "states" and self.encoder != "forecast":
-            raise DelayRLError(f"forecast_learns_from needs encoder=forecast; with {self.encoder} give states")
+            raise DelayRLError(f"forecast_learns_from=states+values needs encoder=forecast; got {self.encoder}")
         return replace(self, run_steps=schedule.steps)
 
     def init(self, spec: Spec, key: Key) -> State:

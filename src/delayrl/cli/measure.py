@@ -103,8 +103,8 @@ def _show_environment(p: Probed) -> str:
         lines.append(f"Components of the observation react at the earliest: {each}.")
     if p.maximum:
         actions = _plural(p.maximum, "action")
-        lines += ["", f"An agent must remember {actions}. This environment delays by itself, which no option counts:"]
-        lines.append("to train, take its delay out and give it as --delay.")
+        lines += ["", f"An agent must remember {actions}. `delayrl train` does not see this delay:"]
+        lines.append("remove it from the environment, and give it as --delay.")
     return "\n".join(lines)
 
 
