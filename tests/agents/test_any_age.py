@@ -212,8 +212,8 @@ def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator)
     np.testing.assert_allclose(follow_changes(actor, x, state)["deviation"], np.sqrt(square), rtol=1e-4)
 
 
-def test_values_may_move_the_forecast(rng: np.random.Generator) -> None:
-    """Then an update differs in the forecast alone, and only after its first step in what the policy reads."""
+def test_values_may_move_the_forecast() -> None:
+    """The first update then moves the policy as before, for it read the same forecast, but the forecast elsewhere."""
     state = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
     windows = random_windows(Spec(OBS, ACT, 3))
     alone, both = (a.update(state, windows, jax.random.key(1), jnp.int32(4))[0] for a in (FORECASTING, VALUED))

@@ -116,17 +116,15 @@ def test_sigkill_at_random_moments(agent: str, trial: int, tmp_path: Path, whole
     sigkilled(agent, int(moment), tmp_path / "cut", runs)
 
 
+KEPT = ("any-age", "vdpo")  # the others are thorough
+
+
 @pytest.mark.parametrize(
     ("agent", "at", "options"),
     [
         ("bpql", 260, {"protocol": "official"}),
         ("bpql", 237, {"precision": "bfloat16", "hidden": [FEW, FEW]}),
-        *((agent, 237, {}) for agent in ("any-age", "vdpo")),
-        *(
-            pytest.param(agent, 237, {}, marks=pytest.mark.thorough)
-            for agent in AGENTS
-            if agent not in ("any-age", "vdpo")
-        ),
+        *(pytest.param(agent, 237, {}, marks=() if agent in KEPT else pytest.mark.thorough) for agent in AGENTS),
     ],
 )
 def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict, tmp_path: Path, monkeypatch) -> None:
