@@ -310,8 +310,12 @@ class Policy {
 
     // obs [S]; actions [Δ, A], oldest first, in the task's units; age 0..Δ -> action [A]
     Floats act(const Floats& obs, const Floats& actions, std::size_t age) const {
-        if (obs.size() != obs_size || actions.size() != max_age * action_size || age > max_age)
-            refuse("the policy takes an observation, an action history and an age of other sizes");
+        if (age > max_age)
+            refuse("the policy takes ages 0.." + std::to_string(max_age) + "; got " + std::to_string(age));
+        if (obs.size() != obs_size || actions.size() != max_age * action_size)
+            refuse("the policy takes " + std::to_string(obs_size) + " numbers of an observation and " +
+                   std::to_string(max_age * action_size) + " of the action history; got " +
+                   std::to_string(obs.size()) + " and " + std::to_string(actions.size()));
         for (float value : obs)
             if (!std::isfinite(value)) refuse("the observation holds a number that is not finite");
         Floats scaled(age * action_size);
@@ -470,8 +474,9 @@ void serve(const Policy& policy) {
         for (float& value : obs) words >> value;
         for (float& value : actions) words >> value;
         std::string rest;
-        if (!words || !(age >= 0 && age <= static_cast<double>(policy.max_age)) || age != std::floor(age) || words >> rest)
-            refuse("a line needs an age, an observation and an action history, nothing else");
+        if (!words || !(age >= 0 && age < 1e9) || age != std::floor(age) || words >> rest)
+            refuse("a line needs an age, " + std::to_string(obs.size()) + " numbers of an observation and " +
+                   std::to_string(actions.size()) + " of the action history, nothing else");
         const Floats action = policy.act(obs, actions, static_cast<std::size_t>(age));
         for (std::size_t j = 0; j < action.size(); ++j) std::printf(j ? " %.9g" : "%.9g", action[j]);
         std::printf("\n");

@@ -40,7 +40,13 @@ def find_module(source: str) -> ModuleType:
         raise DelayRLError(f"a module is named as in an import, such as {name}; got {source!r}")
     _search_working_folder()
     with one_line(f"cannot import {source!r}"):
-        return importlib.import_module(source)
+        try:
+            return importlib.import_module(source)
+        except ModuleNotFoundError as error:
+            if error.name != source.partition(".")[0]:  # the module is there, and needs another that is not
+                raise
+            hint = f"it is looked for in the working folder, {os.getcwd()}, and among installed packages"
+            raise DelayRLError(f"cannot import {source!r}: {described(error)}; {hint}") from error
 
 
 def _search_working_folder() -> None:

@@ -56,7 +56,7 @@ def forge(bundle: Path, change: Callable[[dict[str, Any]], Any] | None = None, *
 
 def test_intact_bundles_load(bundle: Path) -> None:
     policy = load_bundle(bundle)
-    assert (policy.obs_size, policy.action_size, policy.min_age, policy.max_age, policy.dt) == (10, 2, 0, 4, 0.02)
+    assert (policy.obs_size, policy.action_size, policy.max_age, policy.dt) == (10, 2, 4, 0.02)
     assert policy.metadata["env"] == "Reacher-v5"
     forge(bundle)  # forging alone breaks nothing
     (bundle / "README.md").write_text("a model card may lie beside it")

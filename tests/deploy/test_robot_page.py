@@ -95,5 +95,5 @@ def test_the_loop_on_a_robot(tmp_path: Path, monkeypatch, capsys) -> None:
     exec(compile(code, "loop.py", "exec"), own | {"standing": np.zeros(1)})
     assert sent[-1] == 0.75
     assert set(sent[-10:]) == {0.75} != set(sent)
-    assert (np.diff(times[6:29]) < 0.005).sum() < 8  # of the 15 periods of the stall no burst is made up for
+    assert (np.diff(times[5:29]) < 0.005).sum() < 3  # no period of the stall is made up for; a busy machine oversleeps
     assert "overruns=" in capsys.readouterr().out

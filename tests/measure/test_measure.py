@@ -676,6 +676,17 @@ def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "No such file" in refused(capsys, path, "--save", tmp_path / "no" / "x.txt")
 
 
+def test_a_slow_camera_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its rows repeat the newest image: 60 ms apart, in rows and steps of 20 ms."""
+    u, y = signals("servo", 4)
+    held = y[np.arange(len(y)) // 3 * 3]
+    assert from_log(log(tmp_path / "log.csv", u, y)).renewed == pytest.approx(ROW)
+    main(["measure", str(log(tmp_path / "camera.csv", u, held))])
+    assert "The observation changes every 60 ms, more rarely than the loop decides" in capsys.readouterr().out
+    main(["measure", str(log(tmp_path / "camera.csv", u, held)), "--period", "60ms"])
+    assert "changes every" not in capsys.readouterr().out
+
+
 def test_command_for_environments(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     module = "import gymnasium\nfrom delayrl.wrappers import Delayed\n\n\ndef make_env():\n"
     module += "    return Delayed(gymnasium.make('Pendulum-v1'), 2)\n"

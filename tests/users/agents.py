@@ -32,7 +32,7 @@ typed(
 )
 typed("delayrl export package --out package-bundle", "late-ddpg on arm:make, ages 0..3")
 typed("delayrl latency package-bundle --decisions 20", "numpy")
-refused("delayrl evaluate package --delay 'burst(steps=4)'", "trained for delays up to 3 steps; got 4")
+refused("delayrl evaluate package --delay 'burst(steps=4)'", "takes delays up to 3 steps; got 4; train with --delay 4")
 
 point(5, "the same in Python; it is the same run")
 rows = delayrl.Run("package").rows()

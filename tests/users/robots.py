@@ -34,7 +34,7 @@ def overruns(policy, delay, phase, steps=50):
 point(12, "a delay at every phase of the sensor")
 typed(
     f"{TRAIN} --delay 80ms~ --observation-norm running --out phase",
-    "delay: up to 5 steps of 20 ms",
+    "delay: episode:4:5, up to 5 steps of 20 ms",
     "delay episode:4:5",
 )
 holds("80 ms are 4 or 5 steps of 20 ms, and a phase stays", delayrl.Run("phase").config["delay"] == "episode:4:5")
@@ -80,7 +80,7 @@ holds("which is 2, 3 or 4 steps", set.union(*episodes) == {2, 3, 4}, episodes)
 typed(f"{TRAIN} --delay episode:2:4 --out episode --quiet", "delay episode:2:4")
 for delay in ("2", "4", "episode:2:3", "episode:choice:1=0.5,4=0.5"):
     typed(f"delayrl evaluate episode --episodes 2 --delay {delay}", f"delay {delay}")
-refused("delayrl evaluate episode --delay 5", "trained for delays up to 4 steps; got 5")
+refused("delayrl evaluate episode --delay 5", "takes delays up to 4 steps; got 5; train with --delay 5")
 refused("delayrl train random --env arm:make --delay episode:4:2", "LOW ≤ HIGH")
 
 point(14, "policies of other libraries; Stable-Baselines3's is examples/stable_baselines_robot.py")

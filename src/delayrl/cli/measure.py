@@ -141,7 +141,7 @@ def _show_stamps(e: Estimated) -> list[str]:
     lines.append(f"{'age when the next arrives':<26}{_ms(e.span[1])} or less for 99 % of those in use")
     lines.append(f"{'in steps of ' + _ms(e.period):<26}" + _shares(e.counts))
     note = "Exact if one clock gave both stamps: an offset between two clocks is in every delay, and cannot be seen."
-    lines.append(note)
+    lines += [note, "It is the way of the observation alone: if commands act N steps late, add +action=N."]
     if e.drift is not None and abs(e.drift) > 200:
         lines.append(f"The smallest delays change by {e.drift:.0f} parts per million: the clocks may run apart.")
     return lines
@@ -161,6 +161,9 @@ def _show_correlation(e: Estimated) -> list[str]:
         lines.append(f"{'in parts of the log':<26}{parts} ms")
     shares = f"; parts: {_shares(e.counts)}" if len(e.counts) > 1 else ""
     lines.append(f"{'in steps of ' + _ms(e.period):<26}{e.step}{shares}")
+    if e.renewed is not None and e.renewed > 1.2 * e.period:
+        every = f"The observation changes every {_ms(e.renewed)}, more rarely than the loop decides"
+        lines.append(f"{every}: its age varies, and this is one of its values. Log stamps instead (docs/measure.md).")
     if e.high - e.low > 4.5 * e.row:
         lines += ["The log does not settle it: the interval is wide. --plot shows what else is there; log more rows."]
     if e.row > 0.6 * e.period:

@@ -14,7 +14,8 @@ def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
         step_seconds: the length of an environment step.
 
     Returns:
-        "80 steps = 3.2 s" for a delay in steps, "2 steps of 40 ms" for one in time; of a random delay the longest.
+        "80 steps = 3.2 s" for a delay in steps, "2 steps of 40 ms" for one in time; of a random delay the longest. If
+        a time becomes more than a number of steps, the law comes first: "episode:2:3, up to 3 steps of 40 ms".
     """
     count = "1 step" if delay.maximum == 1 else f"{delay.maximum} steps"
     if not (delay.observation.constant and delay.action.constant):
@@ -22,7 +23,8 @@ def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
     try:
         as_delay(given)
     except DelayRLError:  # a time, which cannot be read without the length of a step
-        return f"{count} of {_time(step_seconds)}"
+        law = "" if str(delay) == str(delay.maximum) else f"{delay}, "
+        return f"{law}{count} of {_time(step_seconds)}"
     return f"{count} = {_time(delay.maximum * step_seconds)}"
 
 

@@ -23,7 +23,7 @@ class Bundle:
         network: sizes, range of the actions, and architecture.
         obs_size, action_size: S and A.
         low, high: the range of the actions, [A], in the task's units.
-        min_age, max_age: the ages that it was trained for, in steps; max_age is Δ.
+        max_age: Δ, the longest age that it takes, in steps.
         dt: seconds between two decisions; None if the task does not say.
         action_delay: the longest delay of actions in training, in steps, which is part of the age; 0 if unknown.
         idle: what acted in training before the first command, [A]; None if unknown.
@@ -35,7 +35,7 @@ class Bundle:
         self.network, self.metadata, self.backend, self._act = network, metadata, backend, act
         self.obs_size, self.action_size = network.obs_size, network.action_size
         self.low, self.high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
-        self.min_age, self.max_age = 0, network.max_age
+        self.max_age = network.max_age
         dt: Any = metadata.get("dt")
         self.dt = float(dt) if type(dt) in (int, float) and SHORTEST_STEP <= dt <= LONGEST_STEP else None
         lag: Any = metadata.get("action_delay")
@@ -72,7 +72,7 @@ class Bundle:
         if actions.shape != shape:
             raise DelayRLError(f"the policy takes an action history of shape {shape}; got {actions.shape}")
         if not 0 <= age <= self.max_age:
-            raise DelayRLError(f"the policy was trained for ages 0..{self.max_age}; got {age}")
+            raise DelayRLError(f"the policy takes ages 0..{self.max_age}; got {age}")
         if not (np.isfinite(obs).all() and np.isfinite(actions[:age]).all()):
             raise DelayRLError("the policy was given an observation or an action that is not a finite number")
         with np.errstate(all="ignore"):

@@ -66,7 +66,7 @@ def measure(bundle: str, backend: str, decisions: int, ages: Sequence[int] | Non
     random, rows = np.random.default_rng(0), []
     for age in ages_of(policy.max_age) if ages is None else ages:
         if not 0 <= age <= policy.max_age:
-            raise DelayRLError(f"the policy was trained for ages 0..{policy.max_age}; got {age}")
+            raise DelayRLError(f"the policy takes ages 0..{policy.max_age}; got {age}")
         times = np.zeros((2, decisions))  # milliseconds by the clock, and of the processor
         for i in range(-WARM_UP, decisions):
             obs = random.standard_normal(policy.obs_size, np.float32)

@@ -59,6 +59,7 @@ class Estimated:
     strength: float | None = None  # of the strongest lag; chance reaches 1 in one of a thousand logs
     peak: Pair | None = None  # largest correlation of increments; its lag includes the plant's own lag
     pairs: tuple[Pair, ...] = ()  # the strongest pairs
+    renewed: float | None = None  # correlation only: seconds between two changes of the observation, the median
     windows: tuple[tuple[float, float], ...] = ()  # (middle in seconds, dead time) of each part that shows one
     replay: tuple[tuple[int, int], ...] = ()  # stamps only: what `save` writes, see `ages.replay`
     longest: float = 0.0  # the largest delay of a window or an observation, in seconds
@@ -285,10 +286,17 @@ def _correlated(
         strength=float(strength.max()),
         peak=pairs[0],
         pairs=pairs[:10],
+        renewed=_renewed(observations, episode) * row,
         windows=tuple(windows),
         longest=max([delay, *(d for _, d in windows)]),
         curve=tuple((lag * row, float(strength[lag]), float(r[lag])) for lag in range(lags)),
     )
+
+
+def _renewed(observations: Array, episode: Array) -> float:
+    """Return how many rows lie between two changes of the observation, the median."""
+    changed = (observations[1:] != observations[:-1]).any(1) | (episode[1:] != episode[:-1])
+    return float(np.median(np.diff(np.flatnonzero(changed)))) if changed.sum() > 1 else 1.0
 
 
 def _pairs(

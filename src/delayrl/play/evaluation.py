@@ -120,7 +120,8 @@ def servable(env: TaskLike, delay: DelayLike, spec: Spec) -> Delay:
     """Return the delay without that of rewards. Raises DelayRLError if it is longer than a policy was trained for."""
     served = delay_of(env, delay).acted()
     if served.maximum > spec.delay:
-        raise DelayRLError(f"the policy was trained for delays up to {spec.delay} steps; got {served.maximum}")
+        further = f"train with --delay {served.maximum} for more"
+        raise DelayRLError(f"the policy takes delays up to {spec.delay} steps; got {served.maximum}; {further}")
     return served
 
 

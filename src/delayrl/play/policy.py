@@ -67,7 +67,7 @@ class Policy:
         if obs.shape != (self.spec.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.spec.obs_size}; got shape {obs.shape}")
         if not 0 <= age <= self.spec.delay:
-            raise DelayRLError(f"the policy was trained for ages 0..{self.spec.delay}; got {age}")
+            raise DelayRLError(f"the policy takes ages 0..{self.spec.delay}; got {age}")
         actions = actions.reshape(-1, self.spec.action_size) if actions.size == 0 else actions
         if actions.ndim != 2 or actions.shape[1] != self.spec.action_size:
             raise DelayRLError(f"actions are rows of {self.spec.action_size} numbers; got shape {actions.shape}")

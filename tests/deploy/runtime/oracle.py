@@ -307,7 +307,7 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
     assert (got.missed, got.replaced) == (oracle.missed + missed, oracle.replaced + replaced)
     assert got.counted == len(oracle.ages)
     if exact and oracle.ages:
-        assert got.age_max == max(oracle.ages)
+        assert (got.age_min, got.age_max) == (min(oracle.ages), max(oracle.ages))
         moments = [("age", oracle.ages)]
         if setting.seconds:
             moments += [("delay", oracle.delays), ("period", oracle.periods)]

@@ -205,7 +205,7 @@ class Controller:
                 if age > limit:
                     self._telemetry.counts["overruns"] += 1
                     if self.on_overrun == "raise":
-                        raise OverrunError(f"the policy was trained for ages 0..{limit}; the newest is {age} steps old")
+                        raise OverrunError(f"the policy takes ages 0..{limit}; the newest is {age} steps old")
             if age <= limit or (self.on_overrun == "clip" and len(newest.actions) == age):
                 action = _decide(policy, newest.obs, newest.actions, min(age, limit))
             else:

@@ -14,13 +14,14 @@ class Statistics:
     `age_*`, `delay_*` and `period_*` leave out the cold start of an episode: they begin with the first decision whose
     observation was made after the first command. Before, the age only shows how long the episode has run. Decisions
     that `on_overrun="raise"` refuses appear in `overruns` only. The means and deviations are NaN while nothing has been
-    counted (`age_max` is 0), and `delay_*` and `period_*` are NaN with stamps in steps.
+    counted (`age_min` and `age_max` are 0), and `delay_*` and `period_*` are NaN with stamps in steps.
     """
 
     decisions: int  # actions chosen by `act`
     counted: int  # decisions after the cold start
     age_mean: float  # steps, with actions in flight: the effective delay
     age_std: float  # steps: the jitter
+    age_min: int
     age_max: int
     delay_mean: float  # seconds from an observation's stamp to the decision
     delay_std: float
@@ -64,12 +65,13 @@ class Telemetry:
         names = ("decisions", "overruns", "missed", "replaced", "overridden", *get_args(Arrival))
         self.counts = dict.fromkeys(names, 0)
         self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
-        self._age_max = 0
+        self._age_min = self._age_max = 0
 
     def add(self, age: int, delay: float, period: float) -> None:
         """Add a decision: the age in steps, the time since its observation was made and since the last command."""
-        self._ages.add(age)
+        self._age_min = min(self._age_min, age) if self._ages.count else age
         self._age_max = max(self._age_max, age)
+        self._ages.add(age)
         if self._stamps == "seconds":
             self._delays.add(delay)
             self._periods.add(period)
@@ -77,7 +79,8 @@ class Telemetry:
     def snapshot(self) -> Statistics:
         """Return all numbers so far."""
         moments = self._ages.named("age") | self._delays.named("delay") | self._periods.named("period")
-        return Statistics(**self.counts, **moments, counted=self._ages.count, age_max=self._age_max)
+        ages = {"counted": self._ages.count, "age_min": self._age_min, "age_max": self._age_max}
+        return Statistics(**self.counts, **moments, **ages)
 
 
 def served(max_age: int, action_delay: int, dt: float | None) -> str:
