@@ -31,6 +31,7 @@ STEPS = {"HalfCheetah-v5": 100_000, "delayrl/Pusher-v4": 40_000, "InvertedDouble
 SEEDS = 5
 COLOURS = {
     "`sac`, no delay": "#8c8c8c",
+    "`sac`, no delay, `critic_norm=layer`": "#c4c4c4",
     "`any-age`": "#8250df",
     "`vdpo` †": "#1f6feb",
     "`lifting`": "#bc4c00",
@@ -57,7 +58,8 @@ def section(files: list[Path], pictures: Path) -> str:
     made += (
         "deviation over seeds, each of ten episodes. † reads the true state while it trains. VDPO has `--tokens 1280`. "
     )
-    made += "With `critic_norm=layer`, BPQL's critics have layer normalisation, as any-age's have. "
+    made += "Any-age's critics have layer normalisation, and with `critic_norm=layer` those of SAC and BPQL; those of "
+    made += "VDPO, lifting and A-SAC have none. "
     made += f"{made_on(used)} {rows_of(files, tables)}"
     return f"{table(chosen)}\n\n{made}"
 
