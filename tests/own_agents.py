@@ -1,6 +1,6 @@
 """Agents such as users bring: a class, an instance that its class does not make again, and presets of their own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import jax
@@ -53,6 +53,19 @@ WIDE = Shrink(width=16)
 DELAYED = Shrink(sees="delayed")  # `sees` is no option, so the class and the options do not make it again
 ENTRY = Registration("Shrinks, with presets.", "Nobody, 2026", {"tiny": Preset(Shrink(width=2), Schedule(steps=120))})
 BARE = Registration("Has nothing to train with.", "-", {})
+
+
+@dataclass(frozen=True)
+class Growing(Shrink):
+    """Has a hidden unit for every 50 steps of its run."""
+
+    units: int = 1
+
+    def for_run(self, schedule):
+        return replace(self, units=schedule.steps // 50)
+
+    def init(self, spec, key):
+        return Shrink.init(replace(self, width=self.units), spec, key)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,8 @@
 """Options of dataclasses: named, checked, rebuilt."""
 
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
 import numpy as np
 import pytest
 
@@ -19,6 +22,27 @@ def test_zero_is_allowed_whatever_the_preset() -> None:
     """BPQL's preset `paper` has 1,000; 0 means the end of the random steps."""
     preset = AGENTS["bpql"].presets["paper"]
     assert override(preset.schedule, {"update_after": 0}).first_update == preset.schedule.random_steps
+
+
+@dataclass(frozen=True)
+class Own:
+    """Options as an agent of one's own may have them (docs/own-agent.md)."""
+
+    shift: Annotated[int, "may be negative", (-5, 5)] = -1
+    rates: Annotated[tuple[float, ...], "each within the bounds", (0.0, 1.0)] = (0.5,)
+    layers: Annotated[Literal[1, 2, 4], "a number of a list"] = 2
+
+
+def test_bounds_and_words_of_ones_own_options() -> None:
+    assert override(Own(), {"shift": -3, "rates": [0, 1], "layers": 4}) == Own(-3, (0.0, 1.0), 4)
+    for wrong, words in (
+        ({"shift": -6}, r"shift must lie in -5 \.\. 5; got -6"),
+        ({"shift": 0.5}, r"shift must be a whole number, at least -5; got 0\.5"),
+        ({"rates": [0.5, 7]}, r"rates must lie in 0 \.\. 1; got 7"),
+        ({"layers": 3}, r"layers must be one of 1, 2, 4; got 3"),
+    ):
+        with pytest.raises(DelayRLError, match=f"^{words}$"):
+            override(Own(), wrong)
 
 
 def test_older_runs_of_every_preset() -> None:

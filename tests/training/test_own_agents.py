@@ -70,6 +70,12 @@ def test_a_run_names_its_agent(tmp_path: Path) -> None:
     assert len(evaluate(run.path, 2)["returns"]) == 2
 
 
+def test_a_run_is_played_by_the_agent_of_its_length(tmp_path: Path) -> None:
+    run = train("own_agents:Growing", tmp_path / "run")
+    assert delayrl.load(run.path).agent == own_agents.Growing(units=5)
+    assert len(evaluate(run.path, 2)["returns"]) == 2
+
+
 def test_an_instance_and_presets_by_name(tmp_path: Path) -> None:
     """The name of an instance stands for it; those of a `Registration` are its presets."""
     setup = resolve("own_agents:DELAYED", make_arm, 3, "paper", "corrected", {"factor": 1})

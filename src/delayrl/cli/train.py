@@ -82,7 +82,7 @@ def _add_group(parser: Parser, title: str, config: Any) -> None:
         settings: dict[str, Any] = {"type": _reader(option.kind), "metavar": "VALUE"}
         default = option.default
         if get_origin(option.kind) is Literal:
-            settings = {"choices": get_args(option.kind)}
+            settings = {"choices": get_args(option.kind), "type": type(get_args(option.kind)[0])}
         elif get_origin(option.kind) is tuple:
             settings |= Numbers.of(_reader(get_args(option.kind)[0]))
             default = " ".join(map(str, default))

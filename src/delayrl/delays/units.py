@@ -23,7 +23,7 @@ def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
     try:
         as_delay(given)
     except DelayRLError:  # a time, which cannot be read without the length of a step
-        law = "" if str(delay) == str(delay.maximum) else f"{delay}, "
+        law = "" if str(delay) == str(delay.maximum) else f"{delay.label()}, "
         return f"{law}{count} of {_time(step_seconds)}"
     return f"{count} = {_time(delay.maximum * step_seconds)}"
 

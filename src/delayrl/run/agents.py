@@ -99,10 +99,18 @@ def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = 
     registration = find_agent(config["agent"], folder) if given is None else as_agent(given).registration
     if config["preset"] not in registration.presets:
         raise DelayRLError(f"the run's configuration names an unknown preset, {config['preset']!r}")
-    agent = registration.presets[config["preset"]].agent
+    preset = registration.presets[config["preset"]]
+    agent = preset.agent
     check_names(config["hyperparameters"], agent)
     agent = override(agent, {**(OLDER if config["agent"] in AGENTS else {}), **config["hyperparameters"]})
-    return NormalisedObservations(agent) if config["schedule"].get("observation_norm") == "running" else agent
+    return as_trained(agent, override(preset.schedule, {**OLDER, **config["schedule"]}))
+
+
+def as_trained(agent: Agent, schedule: Schedule) -> Agent:
+    """Return an agent as a run with this schedule trains and plays it."""
+    if for_run := getattr(agent, "for_run", None):
+        agent = for_run(schedule)
+    return NormalisedObservations(agent) if schedule.observation_norm == "running" else agent
 
 
 def agent_names() -> list[str]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
-from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import Preset
 from delayrl.core.protocol import Protocol, opening_length
 from delayrl.core.replay import Learnable
@@ -16,7 +15,7 @@ from delayrl.delays import Delay, DelayLike, as_delay, short_label
 from delayrl.envs.making import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
-from delayrl.run.agents import AgentLike, as_agent, find_agent
+from delayrl.run.agents import AgentLike, as_agent, as_trained, find_agent
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.rows import CONDITION
 
@@ -154,11 +153,7 @@ def resolve(
             f"a run keeps its delay as text, and {str(parsed)[:60]!r} cannot be read back: use delayrl.delays"
         )
     condition = Condition(name, str(task), text, preset, protocol, dict(overrides), schedule.steps)
-    made = override(base.agent, values)
-    if for_run := getattr(made, "for_run", None):
-        made = for_run(schedule)
-    if schedule.observation_norm == "running":
-        made = NormalisedObservations(made)
+    made = as_trained(override(base.agent, values), schedule)
     return Setup(condition, task, made, schedule, parsed, chosen)
 
 

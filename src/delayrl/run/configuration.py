@@ -44,14 +44,15 @@ class Option:
             value = value.item()
         if get_origin(self.kind) is Literal:
             if value not in get_args(self.kind):
-                raise DelayRLError(f"{self.name} must be one of {', '.join(get_args(self.kind))}; got {value!r}")
+                allowed = ", ".join(map(str, get_args(self.kind)))
+                raise DelayRLError(f"{self.name} must be one of {allowed}; got {value!r}")
             return value
         if get_origin(self.kind) is tuple:
             inner = get_args(self.kind)
             count = len(inner) if inner[-1] is not Ellipsis else None
             if not isinstance(value, tuple | list) or not value or (count and len(value) != count):
                 raise DelayRLError(f"{self.name} takes {count or 'one or more'} numbers; got {value!r}")
-            numbers = tuple(Option(self.name, inner[0], None, "").check(item) for item in value)
+            numbers = tuple(Option(self.name, inner[0], None, "", self.bounds).check(item) for item in value)
             if self.name.endswith("_range") and numbers[0] >= numbers[-1]:
                 raise DelayRLError(f"{self.name} is LOW HIGH, with LOW below HIGH; got {', '.join(map(str, value))}")
             return numbers
@@ -63,9 +64,10 @@ class Option:
             raise DelayRLError(f"{self.name} must {allowed}; got {value!r}")
         if self.kind is float:
             return float(value)
-        least = 0 if 0 in (self.default, self.bounds[0]) else 1  # a preset may have another default
+        bounded = math.isfinite(self.bounds[0])  # else at least 1, or 0 if that is the default
+        least = self.bounds[0] if bounded else 0 if self.default == 0 else 1
         if value != int(value) or value < least:
-            raise DelayRLError(f"{self.name} must be a whole number, at least {least}; got {value!r}")
+            raise DelayRLError(f"{self.name} must be a whole number, at least {least:g}; got {value!r}")
         return int(value)
 
 
