@@ -280,6 +280,18 @@ def test_rows_of_no_cell_are_counted() -> None:
     assert "2 rows belong to no cell" in markdown(summary, "t", {})
 
 
+def test_a_task_that_changed_is_told() -> None:
+    """Another model under the same MuJoCo is another task; under another MuJoCo its fingerprint may differ."""
+    cells = small()
+    rows = anchored(cells)
+    models = [{"mujoco": "3.5.0", "physics": "a"}, {"mujoco": "3.2.7", "physics": "b"}]
+    same = [r | models[r["seed"]] for r in rows]
+    assert not summarise(same, [*cells.values()]).changed
+    summary = summarise([*same[:-1], same[-1] | {"physics": "c"}], [*cells.values()])
+    assert summary.changed == [rows[0]["env"]]
+    assert f"The simulated model of {rows[0]['env']} is not the same" in markdown(summary, "t", {})
+
+
 def test_rows_of_two_things_under_one_cell() -> None:
     c = standing("bpql", "Ant-v4", 5)
     rows = [row(c, 0, 100, 1.0), row(c, 0, 200, 1.0) | {"env": "Hopper-v4"}]

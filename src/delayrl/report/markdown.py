@@ -21,9 +21,7 @@ def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequenc
     """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
     legend = "† reads the true state while it trains. ± is the standard deviation over seeds."
     parts = [f"# {_escape(title)}", f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip()]
-    if summary.unplaced:
-        parts.append(f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out.")
-    parts += [_escape(line) for line in wording.overrides(summary) + wording.made_with(versions)]
+    parts += [_escape(line) for line in wording.remarks(summary, versions)]
     for setting in summary.settings:
         results = [r for r in summary.results.values() if r.place.setting == setting]
         protocol, preset = _escape(setting.protocol), _escape(setting.preset)

@@ -48,14 +48,11 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
     names: Names = {"settings": settings, "tasks": tasks, "delays": delays, "agents": agents, "anchors": [*anchored]}
     seeds = {s: wording.seeds(r for r in results if r.place.setting == s) for s in settings}
     styles = figures.styles(agents)
-    notes = wording.overrides(summary) + wording.made_with(versions)
-    if summary.unplaced:
-        notes.append(f"{summary.unplaced:,} rows belong to no cell of the grid; left out.")
     return {
         "title": title,
         "state": wording.states(summary),
         "counts": Counter(r.progress.state for r in results),
-        "notes": notes,
+        "notes": wording.remarks(summary, versions),
         "paper": wording.paper(summary).replace("`", ""),
         "settings": [s._asdict() | {"seeds": seeds[s]} for s in settings],
         "tasks": tasks,

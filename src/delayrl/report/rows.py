@@ -46,6 +46,7 @@ class RowGroup:
     configuration: str | None  # the hash of its options; None if the rows name none
     privileged: bool  # whether the agent's behaviour reads the true state while it trains
     config: Mapping[str, Any] = field(default_factory=dict)  # of its runs, where it is known
+    physics: set[tuple[str, str]] = field(default_factory=set)  # MuJoCo's version, and the model's fingerprint under it
     curves: dict[tuple[str, int], dict[int, Evaluation]] = field(
         default_factory=lambda: defaultdict(lambda: defaultdict(Evaluation))
     )
@@ -96,6 +97,8 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
         if episode in evaluation.episodes:
             place = f"{groups[key].condition}, seed {seed}, step {step}, episode {episode}"
             raise DelayRLError(f"row {number} of the results is there twice: {place}; give every file of rows once")
+        if row.get("physics") is not None:
+            groups[key].physics.add((str(row.get("mujoco")), str(row["physics"])))
         evaluation.total += value
         evaluation.episodes.add(episode)
     return list(groups.values())

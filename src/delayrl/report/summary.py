@@ -47,6 +47,7 @@ class Summary:
     aggregates: list[Aggregate]
     comparisons: list[Comparison]
     unplaced: int  # how many rows belong to no cell
+    changed: list[str]  # tasks whose physics are not the same in all rows of one MuJoCo version
 
     @property
     def settings(self) -> list[Setting]:
@@ -94,7 +95,16 @@ def summarise(
     labels, shared = _label_cells([cell for cell, _ in standing])
     results = make_results(standing, group_of, labels, inferred=inferred)
     tables, every = make_tables(results), results.values()
-    return Summary(results, shared, tables, _make_aggregates(every), make_comparisons(every), unplaced)
+    changed = _changed_tasks([group for _, group in placed])
+    return Summary(results, shared, tables, _make_aggregates(every), make_comparisons(every), unplaced, changed)
+
+
+def _changed_tasks(groups: Iterable[RowGroup]) -> list[str]:
+    """Return the tasks of which one MuJoCo version has simulated several models: their results are of other tasks."""
+    found: dict[str, set[tuple[str, str]]] = defaultdict(set)
+    for group in groups:
+        found[group.condition.env] |= group.physics
+    return sorted(env for env, models in found.items() if len(models) > len({version for version, _ in models}))
 
 
 Placed = list[tuple[str, RowGroup]]

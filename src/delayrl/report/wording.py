@@ -244,6 +244,17 @@ def overrides(summary: Summary) -> list[str]:
     ]
 
 
+def remarks(summary: Summary, versions: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Write what must be known of all results: rows left out, tasks that changed, overrides, machines and libraries."""
+    left_out = [f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out."] * bool(summary.unplaced)
+    changed = [
+        f"The simulated model of {env} is not the same in all rows, under one version of MuJoCo: returns of different "
+        "tasks stand together."
+        for env in summary.changed
+    ]
+    return left_out + changed + overrides(summary) + made_with(versions)
+
+
 def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:
     """Write a sentence for each machine and set of libraries; commits that differ in nothing else share one."""
     commits: dict[str, list[str]] = {}
