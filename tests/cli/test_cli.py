@@ -68,6 +68,12 @@ def test_evaluate(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert result["mean_return"] == pytest.approx(sum(result["returns"]) / 3)
     main(["evaluate", str(run), "--episodes", "3", "--seed", "1"])
     assert capsys.readouterr().out.endswith(f" over 3 episodes, the lowest {min(result['returns']):.1f}\n")
+    main(["evaluate", str(run), "--episodes", "1"])  # one episode has no deviation
+    out = capsys.readouterr().out
+    assert " over 1 episode, " in out
+    assert "±" not in out
+    main(["evaluate", str(run), "--episodes", "1", "--json"])
+    assert json.loads(capsys.readouterr().out)["std_return"] is None
     main(["evaluate", str(run), "--episodes", "3", "--delay", "1"])
     out, err = capsys.readouterr()
     assert "delay 1" in out

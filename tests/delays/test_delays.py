@@ -329,6 +329,17 @@ def test_bad_recordings(content: str, words: str, tmp_path: Path) -> None:
         recorded(tmp_path / "trace.csv")
 
 
+def test_a_home_that_nobody_has() -> None:
+    with pytest.raises(DelayRLError, match=r"^~nobody-of-that-name/delays\.txt cannot be read as recorded delays: "):
+        as_delay("recorded:~nobody-of-that-name/delays.txt")
+
+
+@pytest.mark.parametrize("seconds", ["20ms", 0, -0.05, math.nan, math.inf])
+def test_a_step_that_takes_no_time(seconds: float | str) -> None:
+    with pytest.raises(DelayRLError, match=r"^step_seconds is the seconds of a step, a number above 0; got "):
+        as_delay("80ms", seconds)  # type: ignore[arg-type]
+
+
 def test_recordings_in_odd_forms(tmp_path: Path) -> None:
     (tmp_path / "bom.csv").write_bytes("\ufeff3\r\n1\r\n4\r\n".encode())
     assert recorded(tmp_path / "bom.csv") == Recorded((3, 1, 4))

@@ -21,7 +21,7 @@ from delayrl.delays import as_delay
 from delayrl.envs.task import quiet
 from delayrl.measure import from_log, probe
 from delayrl.measure.log import rounded_up_steps
-from delayrl.measure.reading import read_signals
+from delayrl.measure.reading import Table, read_signals
 from delayrl.wrappers import AugmentedObservation, Delayed
 
 ROOT = Path(__file__).parents[2]
@@ -334,7 +334,7 @@ def test_whole_names_come_before_prefixes(
     """A word that is the name of a column means this column alone, and no prefix takes it from there."""
     names = ["time", "q1", "q1_cmd", "q1_cmd_seen", "q2_cmd", "q2_velocity", "action", "action_raw"]
     path = write(tmp_path / "log.csv", {name: np.arange(5.0) for name in names})
-    log = read_signals(path, commands=commands, observations=observations)
+    log = read_signals(Table(path), commands=commands, observations=observations)
     assert (list(log.command_names), list(log.observation_names)) == wanted
 
 

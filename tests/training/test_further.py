@@ -135,7 +135,7 @@ def files(folder: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize(
     ("wrong", "line"),
     [
-        ({"threads": 0}, "threads must be at least 1"),
+        ({"threads": 0}, "threads must be a whole number, at least 1"),
         ({"track": "mlflow"}, "tensorboard or wandb; got 'mlflow'"),
         ({"callback": 3}, "callback is a function of the step and the runs; got 3"),
         ({"device": "cuda"}, "device must be cpu or gpu"),

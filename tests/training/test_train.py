@@ -57,8 +57,10 @@ def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
         assert one.rows() == other.rows()
         for name, array in arrays(one).items():
             np.testing.assert_array_equal(array, arrays(other)[name])
-    with pytest.raises(delayrl.DelayRLError, match="threads must be at least 1; got 0"):
+    with pytest.raises(delayrl.DelayRLError, match="threads must be a whole number, at least 1; got 0"):
         train("bpql", tmp_path / "run", threads=0)
+    with pytest.raises(delayrl.DelayRLError, match="threads must be a whole number, at least 1; got '2'"):
+        train("bpql", tmp_path / "run", threads="2")
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Any
 
 from delayrl.cli.console import add_env_kwargs, add_stored, print_table, whole
 from delayrl.errors import DelayRLError
+from delayrl.run.rows import mean_return
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -35,9 +36,9 @@ def run(given: argparse.Namespace) -> None:
     if given.json:
         print(json.dumps(result))
     else:
-        returns = f"return {result['mean_return']:.1f} ± {result['std_return']:.1f} over {result['episodes']} episodes"
-        lowest = f"the lowest {min(result['returns']):.1f}"
-        print(f"{result['agent']} on {result['env']}, delay {result['delay']}: {returns}, {lowest}")
+        returns, lowest = result["returns"], f"the lowest {min(result['returns']):.1f}"
+        about = f"{result['agent']} on {result['env']}, delay {result['delay']}"
+        print(f"{about}: return {mean_return(returns)}, {lowest}")
     _say_unfinished(given.run, result["step"])
 
 
@@ -59,7 +60,7 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
         rows = []
         for r in results:
             values = (r["mean_return"], r["std_return"], min(r["returns"]))
-            rows.append([r["delay"], *(f"{value:.1f}" for value in values), r["episodes"]])
+            rows.append([r["delay"], *("" if value is None else f"{value:.1f}" for value in values), r["episodes"]])
         print_table(["delay", "mean return", "std", "lowest", "episodes"], rows)
     _say_unfinished(given.run, results[0]["step"])
     figure = given.run / "delays.png"

@@ -23,12 +23,12 @@ def recorded(path: str | Path, step_seconds: float | None = None, unit: str = ""
         DelayRLError: a missing or empty file, several columns without a header, or a value that is not a finite number
             of at least 0.
     """
-    path = Path(path).expanduser()
     try:
+        path = Path(path).expanduser()
         cells = _cells(path)
     except OSError as error:
         raise DelayRLError(f"cannot read the recorded delays {path}: {error.strerror or error}") from error
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, RuntimeError) as error:  # the last for ~name of nobody
         raise DelayRLError(f"{path} cannot be read as recorded delays: {first_line(error)}") from error
     if not cells:
         raise DelayRLError(f"{path} holds no delays: it is empty")
@@ -76,11 +76,13 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     """Convert a number with a unit ("" for steps, "s" or "ms") to environment steps, without rounding.
 
     Raises:
-        DelayRLError: a time, although the length of a step is unknown.
+        DelayRLError: a time, although the length of a step is unknown; a length that is none.
     """
     if not unit:
         return number
-    if not step_seconds:
+    if step_seconds is not None and (not isinstance(step_seconds, int | float) or not 0 < step_seconds < math.inf):
+        raise DelayRLError(f"step_seconds is the seconds of a step, a number above 0; got {step_seconds!r}")
+    if step_seconds is None:
         hint = "give steps, or the task a `dt`; in Python, `make` and the wrappers take step_seconds"
         raise DelayRLError(f"the task does not say how long a step is (no `dt`): {hint}")
     return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds

@@ -88,7 +88,8 @@ def card(metadata: Mapping[str, Any], repo: str) -> str:
     if isinstance(evaluation, Mapping):
         names = ("mean_return", "std_return", "episodes", "step")
         mean, spread, count, step = (plain(evaluation.get(name)) for name in names)
-        lines += [f"| return | {mean} ± {spread} (standard deviation of {count} episodes, at step {step}) |"]
+        around = "" if evaluation.get("std_return") is None else f" ± {spread}"
+        lines += [f"| return | {mean}{around} (mean ± standard deviation of {count} episodes, at step {step}) |"]
     lines += [f"| checksum | {plain(metadata['checksum'])} |", ""]
     lines += ["The return is raw, of the last evaluation of one training run under its protocol.", ""]
     lines += ["```", "pip install 'delayrl[hub]'", f"delayrl pull {repo} --out bundle", "```", ""]

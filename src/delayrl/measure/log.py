@@ -160,11 +160,12 @@ def from_log(
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
         if value is not None and not (np.isfinite(value) and value >= least):
             raise DelayRLError(f"--{name} is a time in seconds; got {value}")
-    exact = reading.read_stamps(path, stamp, received, episode, unit)
+    table = reading.Table(path)
+    exact = reading.read_stamps(table, stamp, received, episode, unit)
     if exact is not None:
         estimated = _from_stamps(path, *exact, period, warm_up)
     else:
-        log, row = reading.resample(reading.read_signals(path, time, commands, observations, episode, unit))
+        log, row = reading.resample(reading.read_signals(table, time, commands, observations, episode, unit))
         warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
         estimated = _correlated(path, log, row, period or row, longest, warm, seed)
     if estimated.row > SLOW and given is None:

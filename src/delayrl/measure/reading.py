@@ -33,7 +33,7 @@ class Log:
 
 
 def read_signals(
-    path: Path,
+    table: "Table",
     time: str | None = None,
     commands: Sequence[str] | None = None,
     observations: Sequence[str] | None = None,
@@ -44,7 +44,6 @@ def read_signals(
 
     CSV files need a header, and separate columns with commas, semicolons or tabs.
     """
-    table = _Table(path)
     stamps = table.find(time, ("time", "timestamp", "t"), "time stamps", "--time", needed=True)
     groups = {}
     others = [name for name in table.names if name != stamps]
@@ -57,32 +56,32 @@ def read_signals(
         names = [n for n in others if n.lower() in own or (n.lower() not in named and n.lower().startswith(prefixes))]
         if not names:
             hint = f"none begins with {' or '.join(starts)}; name them with --{what}. It has {_few(table.names)}"
-            raise DelayRLError(f"{path} has no column for {what}: {hint}")
+            raise DelayRLError(f"{table.path} has no column for {what}: {hint}")
         groups[what] = names
     both = set(groups["commands"]) & set(groups["observations"])
     if both:
-        raise DelayRLError(f"{path}: {_few(sorted(both))} would be both a command and an observation; use --commands")
+        line = f"{table.path}: {_few(sorted(both))} would be both a command and an observation"
+        raise DelayRLError(f"{line}; use --commands")
     seconds, episodes = table.column(stamps) * UNITS[unit], table.recordings(episode)
-    _check_times(path, stamps, seconds, episodes)
+    _check_times(table.path, stamps, seconds, episodes)
     us, u_names = table.join(groups["commands"])
     ys, y_names = table.join(groups["observations"])
     return Log(seconds - seconds[0], us, ys, episodes, u_names, y_names)
 
 
 def read_stamps(
-    path: Path, stamp: str | None, received: str | None, episode: str | None, unit: str
+    table: "Table", stamp: str | None, received: str | None, episode: str | None, unit: str
 ) -> tuple[Array, Array, Array] | None:
     """Return when observations were made, when they arrived, in seconds, and which recordings they are in, [N] each.
 
     None without both columns of times.
     """
-    table = _Table(path)
     made = table.find(stamp, ("stamp",), "send times", "--stamp")
     arrived = table.find(received, ("received",), "arrival times", "--received")
     if not made or not arrived:
         if stamp or received:
             other = "--received, when observations arrived" if made else "--stamp, when observations were made"
-            raise DelayRLError(f"{path}: stamps need both times; it has no column for {other}")
+            raise DelayRLError(f"{table.path}: stamps need both times; it has no column for {other}")
         return None
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit], table.recordings(episode)
 
@@ -115,7 +114,7 @@ def resample(log: Log) -> tuple[Log, float]:
     return replace(log, time=time, commands=log.commands[taken], observations=observations, episode=episode), step
 
 
-class _Table:
+class Table:
     """The columns of a file, as text or numbers."""
 
     def __init__(self, path: Path) -> None:

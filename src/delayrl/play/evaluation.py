@@ -187,7 +187,7 @@ def evaluate(
 
     Returns:
         agent, env, delay, step (of the training; None for a policy that does not say it), episodes, mean_return,
-        std_return (n - 1 in its denominator), returns.
+        std_return (n - 1 in its denominator; None for one episode), returns.
 
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.

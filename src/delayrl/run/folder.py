@@ -6,6 +6,8 @@ rows.jsonl          one row for each evaluation episode
 metrics.jsonl       losses and speed
 episodes.jsonl      one row for each episode of training
 curve.png           return against steps
+delays.png          return against delay, by `evaluate --sweep`
+tensorboard/        or wandb/: what `--track` wrote
 checkpoints/STEP/   agent.safetensors, loop.safetensors, manifest.json (checksums); the last two are kept
 replay/             the trajectory in pieces, each written once; a run with --slim deletes it when it is complete
 ```

@@ -32,9 +32,16 @@ def whole_evaluations(episodes: Mapping[int, Sized]) -> list[int]:
     return sorted(step for step, played in episodes.items() if len(played) == most)
 
 
-def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float:
-    """Return the standard deviation of episodes' returns, with n - 1 in the denominator; 0 for one episode."""
-    return float(np.std(returns, ddof=1)) if np.size(returns) > 1 else 0.0
+def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float | None:
+    """Return the standard deviation of episodes' returns, with n - 1 in the denominator; None for one episode."""
+    return float(np.std(returns, ddof=1)) if np.size(returns) > 1 else None
+
+
+def mean_return(returns: Sequence[float] | NDArray[np.float64]) -> str:
+    """Write the mean of episodes' returns, ± their standard deviation, and of how many episodes it is."""
+    count, spread = np.size(returns), deviation(returns)
+    episodes = "1 episode" if count == 1 else f"{count} episodes"
+    return f"{np.mean(returns):.1f}" + (f" ± {spread:.1f}" if spread is not None else "") + f" over {episodes}"
 
 
 def name_configuration(rows: Sequence[Row]) -> list[Row]:

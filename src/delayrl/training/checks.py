@@ -24,8 +24,8 @@ from delayrl.wrappers.layers import check_limit, name_of
 def check_ways(ways: Ways) -> None:
     """Raise DelayRLError for ways to train that are none."""
     track = ways.track
-    if ways.threads < 1:
-        raise DelayRLError(f"threads must be at least 1; got {ways.threads}")
+    if type(ways.threads) is not int or ways.threads < 1:
+        raise DelayRLError(f"threads must be a whole number, at least 1; got {ways.threads!r}")
     if track is not None and track not in SERVICES:
         raise DelayRLError(f"track must be {' or '.join(SERVICES)}; got {track!r}")
     if track is not None and find_spec(SERVICES[track]) is None:
