@@ -1,19 +1,30 @@
 """Any-age beside each other agent and delay of a task: the tables of differences in docs/algorithms/any-age.md."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import front
+import numpy as np
 from ladder import area
 from learning.curves import difference, spread
+from scipy import stats
 from which import results_of
 
 from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result, delay_order
+from delayrl.report.statistics import Floats
 
 ENV, OWN = "HalfCheetah-v5", "`any-age`"
-VARIANTS = ("`any-age`, `encoder=mlp`", "`any-age`, `forecast_learns_from=states+values`")
+PLAIN = "`any-age`, `critic_norm=none`"
+"""Compared with the agents whose critics have no layer normalisation either."""
+VARIANTS = (
+    PLAIN,
+    "`any-age`, `encoder=mlp`",
+    "`any-age`, `forecast_learns_from=states+values`",
+    "`bpql`, `batch_size=128`",
+)
 """Shown beside the arms of the first page."""
 
 
@@ -25,7 +36,8 @@ def section(files: list[Path], env: str = ENV) -> str:
     about += (
         "Welch's, of 95 %, and bold where they leave out 0. *Arithmetic* is that of a step of any-age over that of "
     )
-    about += "the other."
+    about += "the other. § stays clear after Holm's correction for all differences of its column. Layer normalisation "
+    about += f"is in the critics of {OWN} and of what has `critic_norm=layer`; {PLAIN} is beside agents without it."
     if "†" in rows:
         about += " † reads the true state while it trains; VDPO has `--tokens 1280`."
     return f"{rows}\n\n{about}"
@@ -37,18 +49,38 @@ def table(results: list[Result], env: str = ENV) -> str:
     for result in front.comparable(results, VARIANTS):
         if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
-    head = ["delay", "any-age's end", "other agent", "its end", "any-age minus it, at the end", "over training"]
-    body = []
+    head = ["delay", "any-age", "its end", "other agent", "its end", "any-age minus it, at the end", "over training"]
+    pairs = []
     for (name, delay), other in sorted(chosen.items(), key=lambda i: (delay_order(i[0][1]), -area(i[1]).mean())):
-        own = chosen.get((OWN, delay))
-        if own is None or name == OWN:
-            continue
-        x, y = own.curves.final, other.curves.final
-        cells = [str(delay), ended_at(own), name, ended_at(other)]
-        cells += [bold(difference(x, y)), bold(difference(area(own), area(other)))]
+        owns = [OWN] if "any-age" in name or "critic_norm" in name else [OWN, PLAIN]
+        pairs += [
+            (own, name, delay, chosen[own, delay], other) for own in owns if (own, delay) in chosen and own != name
+        ]
+    ends = holm([welch(own.curves.final, other.curves.final) for *_, own, other in pairs])
+    areas = holm([welch(area(own), area(other)) for *_, own, other in pairs])
+    body = []
+    for (own_name, name, delay, own, other), end, whole in zip(pairs, ends, areas, strict=True):
+        cells = [str(delay), own_name, ended_at(own), name, ended_at(other)]
+        cells += [bold(difference(own.curves.final, other.curves.final)) + " §" * end]
+        cells += [bold(difference(area(own), area(other))) + " §" * whole]
         ratio = f"{own.cost.flops / other.cost.flops:.2f}" if own.cost and other.cost else ""
         body.append([*cells, ratio])
     return markdown_table([*head, "arithmetic"], body)
+
+
+def welch(one: Floats, other: Floats) -> float:
+    """Return the p-value of a difference of the means."""
+    return float(stats.ttest_ind(one, other, equal_var=False).pvalue)
+
+
+def holm(values: Sequence[float]) -> list[bool]:
+    """Return which p-values stay below 5 % after Holm's correction for all of them (Holm, 1979)."""
+    clear = [False] * len(values)
+    for passed, index in enumerate(np.argsort(values)):
+        if values[index] > 0.05 / (len(values) - passed):
+            break
+        clear[index] = True
+    return clear
 
 
 def ended_at(result: Result) -> str:

@@ -36,12 +36,41 @@ def test_rows_are_what_has_ended_at_the_same_delay() -> None:
     results = summarise(rows, [made for made, _ in cells]).results.values()
     _, _, *body = against.table([*results]).splitlines()
     shown = [[text.strip() for text in line.strip("|").split("|")] for line in body]
-    assert [line[:4] for line in shown] == [
-        ["25", "12 ± 1 (10 seeds)", "`vdpo` †", "12 ± 2"],
-        ["25", "12 ± 1 (10 seeds)", "`bpql`", "3 ± 2"],
+    assert [line[:5] for line in shown] == [
+        ["25", "`any-age`", "12 ± 1 (10 seeds)", "`vdpo` †", "12 ± 2"],
+        ["25", "`any-age`", "12 ± 1 (10 seeds)", "`bpql`", "3 ± 2"],
     ]
-    assert not shown[0][4].startswith("**")
-    assert shown[1][4].startswith("**+9 (+")
+    assert not shown[0][5].startswith("**")
+    assert shown[1][5].startswith("**+9 (+")
+    assert [line[5].endswith("§") for line in shown] == [False, True]
+
+
+def test_equal_critics_are_compared_too() -> None:
+    """Any-age without layer normalisation stands beside agents without it, and not beside those with it."""
+    five = [1.0, 2, 3, 4, 5]
+    cells = [cell("any-age", five, 25), cell("any-age", five, 25, id="plain", overrides={"critic_norm": "none"})]
+    cells += [cell("bpql", five, 25, id="a"), cell("bpql", five, 25, id="b", overrides={"critic_norm": "layer"})]
+    rows = [row(made, s, made[0].condition.steps, x, 0, "agent") for made, ends in cells for s, x in enumerate(ends)]
+    _, _, *body = against.table([*summarise(rows, [made for made, _ in cells]).results.values()]).splitlines()
+    shown = {tuple(text.strip() for text in line.strip("|").split("|"))[1:4:2] for line in body}
+    assert shown == {
+        ("`any-age`", "`bpql`"),
+        (against.PLAIN, "`bpql`"),
+        ("`any-age`", "`bpql`, `critic_norm=layer`"),
+        ("`any-age`", against.PLAIN),
+    }
+
+
+@pytest.mark.parametrize(
+    ("values", "clear"),
+    [
+        ([0.04, 0.01, 0.02], [True, True, True]),  # 0.01 < 0.05 / 3, 0.02 < 0.05 / 2, 0.04 < 0.05
+        ([0.04, 0.01, 0.03], [False, True, False]),  # 0.03 > 0.05 / 2, and what follows is not asked
+        ([], []),
+    ],
+)
+def test_holms_correction(values: list[float], clear: list[bool]) -> None:
+    assert against.holm(values) == clear
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from delayrl.agents.base import Agent, State, template
 from delayrl.core.cache import keep_compiled
-from delayrl.core.types import Spec
+from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, stored_delay
 from delayrl.envs.making import make
@@ -47,10 +47,15 @@ class Policy:
         self.agent, self.state, self.spec, self.step = agent, state, spec, step
         self.low, self.high = inner_range(low, high)
         self._key = jax.random.key(seed)
-        self._act = jax.jit(lambda state, seen, key: agent.act(state, seen, key, explore=False))
+
+        def decide(state: State, seen: Seen, key: Key) -> Action:
+            with jax.default_matmul_precision("float32"):  # as in evaluation: a GPU's own is coarser
+                return agent.act(state, seen, key, explore=False)
+
+        self._act = jax.jit(decide)
 
     def act(self, obs: NDArray[Any], info: dict[str, Any]) -> NDArray[np.float32]:
-        """Return the deterministic action, in the task's own units.
+        """Return the action, in the task's own units: the policy's mode, but a draw of agents whose evaluation samples.
 
         Args:
             obs: the newest observation that has arrived, [S].
