@@ -56,7 +56,7 @@ def assert_same_results(file: Path, runs: Path, expected: Path) -> None:
     grid: Grid = load_grid(file)
     for cell in grid.cells:
         assert folders.stored(runs / cell.folder, cell.seeds) == (cell.condition.steps, True)
-        pairs = (folders.seed_folders(home / cell.folder, cell.seeds) for home in (runs, expected))
+        pairs = (folders.seed_paths(home / cell.folder, cell.seeds) for home in (runs, expected))
         for mine, theirs in zip(*pairs, strict=True):
             text = (mine / "rows.jsonl").read_text()
             assert text == (theirs / "rows.jsonl").read_text()

@@ -291,7 +291,7 @@ def test_worker(finished, tmp_path: Path) -> None:
     for _ in range(2):
         assert work(home) == Outcome("done", "")
         assert [event["event"] for event in folders.journal(home)] == ["begun", "done"]
-    with folders.hold(home):
+    with folders.hold_cell(home):
         assert work(home).kind == "locked"
         assert progress(grid.cells[0], runs).state == "running"
     wrong = replace(grid.cells[0], id="89ab", condition=replace(grid.cells[0].condition, delay=51))

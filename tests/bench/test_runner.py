@@ -275,7 +275,7 @@ def test_nothing_is_started_on_a_cell_that_is_held(tmp_path: Path) -> None:
     backend, some = Script(sac=[DONE], bpql=[DONE]), cells("sac", "bpql")
     folders.prepare(tmp_path / some[0].folder, some[0])
     with contextlib.ExitStack() as held:
-        held.enter_context(folders.hold(tmp_path / some[0].folder))
+        held.enter_context(folders.hold_cell(tmp_path / some[0].folder))
         free = time.monotonic() + 0.5
 
         def tick() -> None:
@@ -316,18 +316,20 @@ def test_journal_after_a_crash(tmp_path: Path) -> None:
 def test_lock(tmp_path: Path) -> None:
     """A lock has one holder and ends with its process; `holder` does not take it."""
     assert folders.holder(tmp_path) is None
-    code = f"from delayrl.bench.folders import *\nwith hold(Path({str(tmp_path)!r})): print(1, flush=True); input()"
+    code = (
+        f"from delayrl.bench.folders import *\nwith hold_cell(Path({str(tmp_path)!r})): print(1, flush=True); input()"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout.readline() == "1\n"
         assert folders.holder(tmp_path).endswith(f" {other.pid}")
-        with pytest.raises(folders.LockedError), folders.hold(tmp_path, patience=0.1):
+        with pytest.raises(folders.LockedError), folders.hold_cell(tmp_path, patience=0.1):
             pass
         other.kill()
         other.communicate()
     assert folders.holder(tmp_path) is None
-    with folders.hold(tmp_path):
+    with folders.hold_cell(tmp_path):
         assert folders.holder(tmp_path).endswith(f" {os.getpid()}")
 
 

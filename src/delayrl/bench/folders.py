@@ -34,7 +34,7 @@ class LockedError(Exception):
 
 
 @contextlib.contextmanager
-def hold(folder: Path, patience: float = 1.0) -> Iterator[None]:
+def hold_cell(folder: Path, patience: float = 1.0) -> Iterator[None]:
     """Lock a cell until the block or the process ends, however it ends.
 
     Raises:
@@ -89,7 +89,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     return events
 
 
-def seed_folders(folder: Path, seeds: tuple[int, ...]) -> list[Path]:
+def seed_paths(folder: Path, seeds: tuple[int, ...]) -> list[Path]:
     """Return the run folder of each seed."""
     return [folder / f"seed{seed}" for seed in seeds]
 
@@ -97,7 +97,7 @@ def seed_folders(folder: Path, seeds: tuple[int, ...]) -> list[Path]:
 def stored(folder: Path, seeds: tuple[int, ...]) -> tuple[int, bool]:
     """Return the step up to which every seed is stored, and whether the cell is complete."""
     steps, complete = [], []
-    for run in seed_folders(folder, seeds):
+    for run in seed_paths(folder, seeds):
         newest = _newest_checkpoint(run)
         steps.append(newest.step if newest else 0)
         # a complete run that still has a replay was killed before it could delete it

@@ -41,7 +41,7 @@ CREATE VIEW results AS
 def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
     """Yield the rows of cells, each with its cell's id, from run folders. Raises DelayRLError for a damaged row."""
     for cell in cells:
-        for path in folders.seed_folders(runs / cell.folder, cell.seeds):
+        for path in folders.seed_paths(runs / cell.folder, cell.seeds):
             for row in name_configuration(RunFolder(path).read("rows")):
                 yield row | {"cell": cell.id}
 
@@ -123,7 +123,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
     count = 0
     for number, cell in enumerate(grid.cells):
         p = progress(cell, runs)  # before the rows, which may be more
-        paths = zip(folders.seed_folders(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
+        paths = zip(folders.seed_paths(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
         found = [(path, seed, name_configuration(RunFolder(path).read("rows"))) for path, seed in paths]
         here = Held(sum(len(rows) for *_, rows in found), p.state == "done", p.step)
         elsewhere = max(held, key=lambda file: held[file].get(cell.id, Held()), default=None)
@@ -205,7 +205,7 @@ def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
 
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the configurations of the runs that have begun."""
-    paths = [path for cell in cells for path in folders.seed_folders(runs / cell.folder, cell.seeds)]
+    paths = [path for cell in cells for path in folders.seed_paths(runs / cell.folder, cell.seeds)]
     return [RunFolder(path).config for path in paths if (path / "config.json").exists()]
 
 

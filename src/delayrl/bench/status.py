@@ -17,7 +17,7 @@ def progress(cell: Cell, runs: Path) -> Progress:
     folder = runs / cell.folder
     step, complete = folders.stored(folder, cell.seeds)
     holder, events = folders.holder(folder), folders.journal(folder)
-    metrics = folders.newest_metrics(folders.seed_folders(folder, cell.seeds)[0])
+    metrics = folders.newest_metrics(folders.seed_paths(folder, cell.seeds)[0])
     speed = metrics.get("steps_per_second")
     if holder is not None:
         return Progress("running", max(step, int(metrics.get("step", 0))), speed, holder)

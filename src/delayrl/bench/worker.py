@@ -15,7 +15,7 @@ import traceback
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from delayrl.bench.folders import LockedError, hold, journal, note, seed_folders, stored
+from delayrl.bench.folders import LockedError, hold_cell, journal, note, seed_paths, stored
 from delayrl.errors import DelayRLError, StoppedError, described
 from delayrl.run.rows import CONDITION
 
@@ -48,7 +48,7 @@ def main() -> None:
 def work(folder: Path, device: str | None = None) -> Outcome:
     """Lock a cell, then train or resume it. Its folder has its cell.json; the device is "cpu", "gpu" or JAX's own."""
     try:
-        with hold(folder):
+        with hold_cell(folder):
             return _train(folder, json.loads((folder / "cell.json").read_text()), device)
     except LockedError:
         return Outcome("locked", "another process works on it")
@@ -71,7 +71,7 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
     try:
         note(folder, "begun", pid=os.getpid(), step=step)
         condition = {name: cell[name] for name in CONDITION} | cell["overrides"]
-        out = folder if len(seeds) > 1 else seed_folders(folder, seeds)[0]
+        out = folder if len(seeds) > 1 else seed_paths(folder, seeds)[0]
         train(**condition, seed=seeds[0], seeds=len(seeds), out=out, device=device, progress=False, slim=True)
         note(folder, "done")
         return Outcome("done", "")

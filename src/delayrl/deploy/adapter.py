@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from delayrl.deploy.backends.network import Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import check_target, write_files
-from delayrl.deploy.packing import described, pack
+from delayrl.deploy.packing import pack, space_json
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import inner_range
 from delayrl.wrappers import AugmentedObservation, Delayed
@@ -184,8 +184,8 @@ def export_layers(
         "action_delay": policy.action_delay,
         "idle": [float(x) for x in policy.idle],
         "dt": policy.dt,
-        "observation": described(delayed.observation_space),
-        "action": described(delayed.action_space),
+        "observation": space_json(delayed.observation_space),
+        "action": space_json(delayed.action_space),
         "exported_with": {"python": platform.python_version(), "numpy": np.__version__, "gymnasium": gym.__version__},
     }
     write_files(Path(out), pack(network, arrays, metadata), force=force)

@@ -7,7 +7,7 @@ import numpy as np
 
 from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.files import check_target, write_files
-from delayrl.deploy.packing import described, pack
+from delayrl.deploy.packing import pack, space_json
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike
 from delayrl.play.policy import Policy, restored, task_of, trained_delay
@@ -96,8 +96,8 @@ def describe(run: RunFolder, step: int, longest: int, task: Task) -> dict[str, A
         "ages": [0, longest],
         "action_delay": env.delay.action.maximum,
         "dt": seconds_of(env),
-        "observation": described(env.observation_space),
-        "action": described(env.action_space),
+        "observation": space_json(env.observation_space),
+        "action": space_json(env.action_space),
         "normalisation": {
             "observation": "inside the networks: the bundle takes the task's own numbers"
             if config["schedule"].get("observation_norm") == "running"

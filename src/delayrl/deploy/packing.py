@@ -31,7 +31,7 @@ def pack(network: Network, arrays: Arrays, metadata: dict[str, Any]) -> dict[str
     return seal(metadata, files)
 
 
-def described(space: Any) -> dict[str, Any]:
+def space_json(space: Any) -> dict[str, Any]:
     """Return a Box as JSON can hold it, with null for a missing bound."""
     low, high = ([float(x) if np.isfinite(x) else None for x in bound] for bound in (space.low, space.high))
     return {"shape": list(space.shape), "dtype": str(space.dtype), "low": low, "high": high}

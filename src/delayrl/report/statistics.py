@@ -118,7 +118,7 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
 
 
 def bootstrap_steps(
-    steps: ArrayLike, curves: Floats, reference: Floats, repetitions: int = REPETITIONS, seed: int = 0
+    steps: ArrayLike, curves: Floats, reference: Floats, repetitions: int = REPETITIONS
 ) -> tuple[float, float]:
     """Estimate the 95 % interval of the step at which the mean of curves reaches the mean of a reference.
 
@@ -126,8 +126,7 @@ def bootstrap_steps(
         steps: of the evaluations, [N].
         curves: [runs, N], resampled by runs.
         reference: returns of the reference's runs, [seeds], resampled too.
-        repetitions: how many resamples.
-        seed: the same curves and seed give the same interval.
+        repetitions: how many resamples; the same curves always give the same interval.
 
     Returns:
         Lower and upper bound, each one of the steps, or infinite where the curve does not reach the reference. NaN with
@@ -135,7 +134,7 @@ def bootstrap_steps(
     """
     if min(len(curves), len(reference)) < 2:
         return NAN, NAN
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     means = _resample(random, curves, repetitions).mean(1)
     thresholds = _resample(random, reference, repetitions).mean(1, keepdims=True)
     reached = np.nan_to_num(steps_to_threshold(steps, means, thresholds), nan=math.inf)
@@ -150,22 +149,19 @@ def probability_of_improvement(one: ArrayLike, other: ArrayLike) -> Floats:
     return (1 + np.sign(x[..., :, None] - y[..., None, :]).mean((-1, -2))) / 2
 
 
-def improvement_interval(
-    pairs: Sequence[tuple[Floats, Floats]], repetitions: int = REPETITIONS, seed: int = 0
-) -> tuple[float, float]:
+def improvement_interval(pairs: Sequence[tuple[Floats, Floats]], repetitions: int = REPETITIONS) -> tuple[float, float]:
     """Estimate the 95 % interval of the mean probability of improvement over tasks.
 
     Args:
         pairs: final returns of two agents, [n] and [m], for each task; runs are resampled within their agent and task.
         repetitions: how many resamples.
-        seed: the same returns and seed give the same interval.
 
     Returns:
         Lower and upper bound; NaN with fewer than FEWEST runs of either on a task.
     """
     if min(x.size for pair in pairs for x in pair) < FEWEST:
         return NAN, NAN
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     resampled = [[_resample(random, x, repetitions) for x in pair] for pair in pairs]
     means = np.mean([probability_of_improvement(*pair) for pair in resampled], axis=0)
     low, high = np.percentile(means, expanded_percentiles([x.size for pair in pairs for x in pair]))
