@@ -36,8 +36,8 @@ def section(files: list[Path], env: str = ENV) -> str:
     about += (
         "Welch's, of 95 %, and bold where they leave out 0. *Arithmetic* is that of a step of any-age over that of "
     )
-    about += "the other. § stays clear after Holm's correction for all differences of its column. Layer normalisation "
-    about += f"is in the critics of {OWN} and of what has `critic_norm=layer`; {PLAIN} is beside agents without it."
+    about += "the other. § stays clear after Holm's correction for all differences of its column. *Critics* are "
+    about += "any-age's: with layer normalisation, or plain (`critic_norm=none`) beside agents without it."
     if "†" in rows:
         about += " † reads the true state while it trains; VDPO has `--tokens 1280`."
     return f"{rows}\n\n{about}"
@@ -49,7 +49,7 @@ def table(results: list[Result], env: str = ENV) -> str:
     for result in front.comparable(results, VARIANTS):
         if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
-    head = ["delay", "any-age", "its end", "other agent", "its end", "any-age minus it, at the end", "over training"]
+    head = ["delay", "critics", "any-age's end", "other agent", "its end", "any-age minus it, at the end"]
     pairs = []
     for (name, delay), other in sorted(chosen.items(), key=lambda i: (delay_order(i[0][1]), -area(i[1]).mean())):
         owns = [OWN] if "any-age" in name or "critic_norm" in name else [OWN, PLAIN]
@@ -60,12 +60,12 @@ def table(results: list[Result], env: str = ENV) -> str:
     areas = holm([welch(area(own), area(other)) for *_, own, other in pairs])
     body = []
     for (own_name, name, delay, own, other), end, whole in zip(pairs, ends, areas, strict=True):
-        cells = [str(delay), own_name, ended_at(own), name, ended_at(other)]
+        cells = [str(delay), "plain" if own_name == PLAIN else "layer", ended_at(own), name, ended_at(other)]
         cells += [bold(difference(own.curves.final, other.curves.final)) + " §" * end]
         cells += [bold(difference(area(own), area(other))) + " §" * whole]
         ratio = f"{own.cost.flops / other.cost.flops:.2f}" if own.cost and other.cost else ""
         body.append([*cells, ratio])
-    return markdown_table([*head, "arithmetic"], body)
+    return markdown_table([*head, "over training", "arithmetic"], body)
 
 
 def welch(one: Floats, other: Floats) -> float:

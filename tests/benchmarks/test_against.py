@@ -37,8 +37,8 @@ def test_rows_are_what_has_ended_at_the_same_delay() -> None:
     _, _, *body = against.table([*results]).splitlines()
     shown = [[text.strip() for text in line.strip("|").split("|")] for line in body]
     assert [line[:5] for line in shown] == [
-        ["25", "`any-age`", "12 ± 1 (10 seeds)", "`vdpo` †", "12 ± 2"],
-        ["25", "`any-age`", "12 ± 1 (10 seeds)", "`bpql`", "3 ± 2"],
+        ["25", "layer", "12 ± 1 (10 seeds)", "`vdpo` †", "12 ± 2"],
+        ["25", "layer", "12 ± 1 (10 seeds)", "`bpql`", "3 ± 2"],
     ]
     assert not shown[0][5].startswith("**")
     assert shown[1][5].startswith("**+9 (+")
@@ -54,10 +54,10 @@ def test_equal_critics_are_compared_too() -> None:
     _, _, *body = against.table([*summarise(rows, [made for made, _ in cells]).results.values()]).splitlines()
     shown = {tuple(text.strip() for text in line.strip("|").split("|"))[1:4:2] for line in body}
     assert shown == {
-        ("`any-age`", "`bpql`"),
-        (against.PLAIN, "`bpql`"),
-        ("`any-age`", "`bpql`, `critic_norm=layer`"),
-        ("`any-age`", against.PLAIN),
+        ("layer", "`bpql`"),
+        ("plain", "`bpql`"),
+        ("layer", "`bpql`, `critic_norm=layer`"),
+        ("layer", against.PLAIN),
     }
 
 
