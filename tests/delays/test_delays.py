@@ -329,6 +329,10 @@ def test_bad_recordings(content: str, words: str, tmp_path: Path) -> None:
         recorded(tmp_path / "trace.csv")
 
 
+def test_a_length_in_single_precision() -> None:
+    assert as_delay("80ms", np.float32(0.04)).maximum == 2
+
+
 def test_a_home_that_nobody_has() -> None:
     with pytest.raises(DelayRLError, match=r"^~nobody-of-that-name/delays\.txt cannot be read as recorded delays: "):
         as_delay("recorded:~nobody-of-that-name/delays.txt")

@@ -148,6 +148,7 @@ def test_the_papers_noisy_tasks() -> None:
     wrapper = noisy.env
     assert isinstance(wrapper, NoisyActions)
     assert wrapper.probability == 0.1
+    assert NoisyActions(Recorder(), np.float32(0.5)).probability == 0.5
     quiet = delayrl.make("delayrl/Pusher-v4")
     for env in (noisy, quiet):
         env.reset(seed=4)

@@ -2,6 +2,7 @@
 
 import math
 import re
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     """
     if not unit:
         return number
-    if step_seconds is not None and (not isinstance(step_seconds, int | float) or not 0 < step_seconds < math.inf):
+    if step_seconds is not None and (not isinstance(step_seconds, Real) or not 0 < step_seconds < math.inf):
         raise DelayRLError(f"step_seconds is the seconds of a step, a number above 0; got {step_seconds!r}")
     if step_seconds is None:
         hint = "give steps, or the task a `dt`; in Python, `make` and the wrappers take step_seconds"

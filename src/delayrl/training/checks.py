@@ -2,6 +2,7 @@
 
 import warnings
 from importlib.util import find_spec
+from numbers import Integral
 
 import jax
 import numpy as np
@@ -24,7 +25,7 @@ from delayrl.wrappers.layers import check_limit, name_of
 def check_ways(ways: Ways) -> None:
     """Raise DelayRLError for ways to train that are none."""
     track = ways.track
-    if type(ways.threads) is not int or ways.threads < 1:
+    if not isinstance(ways.threads, Integral) or ways.threads < 1:
         raise DelayRLError(f"threads must be a whole number, at least 1; got {ways.threads!r}")
     if track is not None and track not in SERVICES:
         raise DelayRLError(f"track must be {' or '.join(SERVICES)}; got {track!r}")

@@ -32,7 +32,7 @@ class NoisyActions(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray
     """
 
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]], probability: float) -> None:
-        if not isinstance(probability, int | float) or not 0 <= probability <= 1:
+        if not isinstance(probability, int | float | np.number) or not 0 <= probability <= 1:
             raise DelayRLError(f"the probability of a random action must be from 0 to 1; got {probability!r}")
         if find_delayed(env):
             raise DelayRLError("NoisyActions goes inside Delayed: Delayed(NoisyActions(task, 0.1), delay)")
