@@ -8,7 +8,7 @@ from typing import Any
 
 from delayrl.cli.console import add_env_kwargs, add_stored, print_table, whole
 from delayrl.errors import DelayRLError
-from delayrl.run.rows import mean_return
+from delayrl.run.rows import return_in_words
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +38,7 @@ def run(given: argparse.Namespace) -> None:
     else:
         returns, lowest = result["returns"], f"the lowest {min(result['returns']):.1f}"
         about = f"{result['agent']} on {result['env']}, delay {result['delay']}"
-        print(f"{about}: return {mean_return(returns)}, {lowest}")
+        print(f"{about}: return {return_in_words(returns)}, {lowest}")
     _say_unfinished(given.run, result["step"])
 
 

@@ -10,7 +10,7 @@ from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored, add
 from delayrl.errors import DelayRLError
 from delayrl.play.run import Run
 from delayrl.run.folder import seed_folders
-from delayrl.run.rows import mean_return
+from delayrl.run.rows import return_in_words
 
 
 def add_options(parser: Parser, words: Sequence[str]) -> None:
@@ -118,7 +118,7 @@ def _print_summary(run: Run) -> None:
     for policy, text in (("agent", label), ("reference", "its reference, no delay")):
         steps, returns = run.curve(policy)
         if last in steps:
-            print(f"  {text:<24} {mean_return(returns[-1])}")
+            print(f"  {text:<24} {return_in_words(returns[-1])}")
     print(f"  run folder               {run.path}")
     print(f"  learning curve           {run.path / 'curve.png'}")
     print(f"  next                     delayrl evaluate {run.path} --episodes 20")

@@ -37,7 +37,7 @@ def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float | None:
     return float(np.std(returns, ddof=1)) if np.size(returns) > 1 else None
 
 
-def mean_return(returns: Sequence[float] | NDArray[np.float64]) -> str:
+def return_in_words(returns: Sequence[float] | NDArray[np.float64]) -> str:
     """Write the mean of episodes' returns, ± their standard deviation, and of how many episodes it is."""
     count, spread = np.size(returns), deviation(returns)
     episodes = "1 episode" if count == 1 else f"{count} episodes"
