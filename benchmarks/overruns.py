@@ -40,9 +40,8 @@ class Last:
         return self._policy(obs, actions[age - longest : age], longest)
 
 
-def returns(env: gym.Env[Any, Any], policy: ControlPolicy, link: Link, on_overrun: str) -> list[float]:
+def returns(env: gym.Env[Any, Any], controller: Controller, link: Link) -> list[float]:
     """Return the returns of `EPISODES` episodes, each with its own start state and random link."""
-    controller = Controller(policy, on_overrun=on_overrun)
     totals = []
     for episode in range(EPISODES):
         obs, _ = env.reset(seed=1_000_000 + episode)
@@ -73,7 +72,8 @@ def main() -> None:
             ("hold", policy, "hold"),
             ("last", Last(policy), "raise"),
         ):
-            lines.append({"link": asdict(link), "answer": name, "returns": returns(env, player, link, on_overrun)})
+            controller = Controller(player, on_overrun=on_overrun)
+            lines.append({"link": asdict(link), "answer": name, "returns": returns(env, controller, link)})
             print(link, name, np.mean(lines[-1]["returns"]), flush=True)
     out.write_text("".join(json.dumps(line) + "\n" for line in lines))
 

@@ -98,7 +98,7 @@ def test_a_function_of_the_three() -> None:
     controller = Controller(adapt(lambda obs, actions, age: obs[:1] + actions[:age].sum() + age, env))
     controller.observe([0.25, 0, 0], 0)
     assert [float(controller.act()[0]) for _ in range(3)] == [0.25, 1.5, 2.0]  # 0.25, + 0.25 + 1, clipped
-    assert (controller.policy.dt, controller.policy.max_age) == (0.05, 2)
+    assert (controller.policy.dt, controller.policy.max_age, controller.min_age) == (0.05, 2, 2)
     other = Delayed(gym.make("Pendulum-v1"), "200ms", step_seconds=0.1)
     assert (adapt(np.sin, other).dt, adapt(np.sin, other).max_age) == (0.1, 2)
 
@@ -117,6 +117,7 @@ def test_layers_in_a_bundle(name: str, delay: Any, tmp_path: Path) -> None:
     for backend in ("numpy", "onnx"):
         bundle = load_bundle(tmp_path / "bundle", backend)
         assert (bundle.max_age, bundle.action_delay, bundle.dt) == (policy.max_age, policy.action_delay, policy.dt)
+        assert bundle.min_age == policy.min_age == env.get_wrapper_attr("delay").minimum
         for age in range(bundle.max_age + 1):
             obs = random.normal(size=bundle.obs_size).astype(np.float32)
             actions = np.zeros((bundle.max_age, bundle.action_size), np.float32)

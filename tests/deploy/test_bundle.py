@@ -377,6 +377,14 @@ def test_an_idle_action_that_is_none(bundle: Path, idle: Any) -> None:
     assert load_bundle(bundle).idle.tolist() == [1, -0.5]
 
 
+@pytest.mark.parametrize("ages", [None, [], 2, ["2", 3], [True, 3], [-1, 3], [9, 3], [0.5, 3]])
+def test_a_shortest_age_that_is_none(bundle: Path, ages: Any) -> None:
+    forge(bundle, lambda document: document.update(ages=ages))
+    assert load_bundle(bundle).min_age == 0
+    forge(bundle, lambda document: document.update(ages=[2, 3]))
+    assert load_bundle(bundle).min_age == 2
+
+
 @settings(max_examples=150, deadline=None, database=None)
 @given(data=st.data())
 def test_any_change_is_noticed(original: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:

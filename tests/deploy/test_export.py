@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bundles import bundle_of, policy_of, run_of
 
-from delayrl import load, make
+from delayrl import DelayWarning, evaluate, load, make
 from delayrl.cli.main import main
 from delayrl.deploy import Controller, export_run, load_bundle
 from delayrl.deploy.latency import ages_of, latency
@@ -58,6 +58,31 @@ def test_a_run_becomes_a_bundle(run: Path, tmp_path: Path, capsys: pytest.Captur
     assert metadata["trained_with"] == {"numpy": "2"}
     assert metadata["exported_with"]["jax"]
     assert metadata["privileged"] is True
+
+
+def test_the_ages_that_it_learned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """BPQL learns those that its training shows, any-age and VDPO all up to the longest."""
+    learned = {}
+    for name in ("bpql", "any-age", "vdpo"):
+        source = run_of(tmp_path / name, name).path
+        main(["export", str(source), "--out", str(tmp_path / f"{name}-bundle")])
+        policy = load_bundle(tmp_path / f"{name}-bundle")
+        learned[name] = (policy.metadata["ages"], policy.min_age, Controller(policy).min_age)
+    assert learned == {"bpql": ([3, 3], 3, 3), "any-age": ([0, 3], 0, 0), "vdpo": ([0, 3], 0, 0)}
+    assert "ages 3..3\n" in (printed := capsys.readouterr().out)
+    assert printed.count("; held back until 60 ms late\n") == 1
+
+
+def test_an_age_that_was_not_learned_is_told(tmp_path: Path) -> None:
+    path = run_of(tmp_path / "bpql", "bpql").path
+    line = "bpql learned no age below 3 steps, and delay uniform:2:3 shows younger ones"
+    with pytest.warns(DelayWarning, match=line):
+        evaluate(path, 1, "uniform:2:3")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate(path, 1)
+        evaluate(path, 1, "uniform:2:3@wait")
+        evaluate(run_of(tmp_path / "vdpo").path, 1, 0)
 
 
 def test_the_bundle_plays_as_the_run(run: Path, tmp_path: Path) -> None:

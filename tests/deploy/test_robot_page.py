@@ -63,7 +63,7 @@ def test_the_rehearsal(late: int, tmp_path: Path, monkeypatch, capsys) -> None:
 
 
 def test_what_the_bundle_serves() -> None:
-    assert f"  serves                   {served(3, 0, 0.04)}\n" in PAGE
+    assert f"  serves                   {served(0, 3, 0, 0.04)}\n" in PAGE
 
 
 def test_the_loop_on_a_robot(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -62,6 +62,11 @@ class AnyAge:
 
     privileged = False
 
+    @property
+    def every_age(self) -> bool:
+        """Whether the second age is any up to that of the sample."""
+        return self.second_age in ("random", "any")
+
     def ahead(self, spec: Spec) -> int:
         """Return the longest k of the k-step targets."""
         return self.bpql.ahead(spec)

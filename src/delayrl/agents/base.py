@@ -70,8 +70,9 @@ class Agent(Protocol):
     def phases(self) -> tuple[Phase, ...]:
         """Return the agent's updates, each with its schedule."""
 
-    # Two methods are optional. `for_run(schedule)` returns the agent for a run of a schedule, or raises DelayRLError.
-    # `reference_policy(state)` returns the delay-free agent that this one learns too, and its state, or None.
+    # Optional are `for_run(schedule)`, which returns the agent for a run of a schedule or raises DelayRLError,
+    # `reference_policy(state)`, the delay-free agent that this one learns too, and its state, or None, and `every_age`,
+    # whether it learns all ages up to the longest, and not only those that the delay shows.
 
     def init(self, spec: Spec, key: Key) -> State:
         """Return a fresh state. Raises DelayRLError if the agent does not support the task."""

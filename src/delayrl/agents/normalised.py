@@ -46,6 +46,11 @@ class NormalisedObservations:
         """As the inner agent."""
         return self.agent.privileged
 
+    @property
+    def every_age(self) -> bool:
+        """As the inner agent."""
+        return getattr(self.agent, "every_age", False)
+
     def ahead(self, spec: Spec) -> int:
         """Return the inner agent's reach."""
         return self.agent.ahead(spec)

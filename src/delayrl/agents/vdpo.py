@@ -76,6 +76,8 @@ class VDPO:
     ] = 0
     at_age_0: Annotated[Current, "the delayed policy's action in training where nothing is hidden"] = "reference"
 
+    every_age = True
+
     @property
     def privileged(self) -> bool:
         """Whether the reference may act in training. It needs the true state."""

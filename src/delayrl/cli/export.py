@@ -20,7 +20,7 @@ def run(given: argparse.Namespace) -> None:
     from delayrl.deploy.runtime.telemetry import served
 
     metadata = export_run(given.run, given.out, force=given.force, env=given.env, agent=given.agent)
-    longest = metadata["ages"][1]
-    print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages 0..{longest}")
-    print(f"  serves                   {served(longest, metadata['action_delay'], metadata['dt'])}")
+    shortest, longest = metadata["ages"]
+    print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages {shortest}..{longest}")
+    print(f"  serves                   {served(shortest, longest, metadata['action_delay'], metadata['dt'])}")
     print(f"  next                     delayrl latency {given.out}")

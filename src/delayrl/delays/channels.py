@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from delayrl.delays import laws
 from delayrl.delays.episodes import OURS, PerEpisode, Sum
 from delayrl.delays.laws import Constant, DelayLaw
-from delayrl.delays.own import is_law, own_law
+from delayrl.delays.own import OwnLaw, is_law, own_law
 from delayrl.errors import DelayRLError
 
 Rule = Literal["newest", "fifo", "raw", "wait"]
@@ -37,6 +37,11 @@ class Channel:
     def maximum(self) -> int:
         """The longest delay."""
         return self.law.maximum
+
+    @property
+    def minimum(self) -> int:
+        """The shortest delay, even if its probability is 0."""
+        return self.maximum if self.rule == "wait" else _shortest(self.law)
 
     @property
     def constant(self) -> bool:
@@ -85,6 +90,11 @@ class Delay:
     def maximum(self) -> int:
         """Δ, the longest history that a decision needs: the longest observation delay and the longest action delay."""
         return self.observation.maximum + self.action.maximum
+
+    @property
+    def minimum(self) -> int:
+        """The age that every observation has at least, once the first of the episode has it."""
+        return self.observation.minimum + self.action.minimum
 
     @property
     def latest(self) -> int:
@@ -140,6 +150,16 @@ class Delay:
         if self.reward.maximum:
             parts.append(f"reward={self.reward}")
         return "+".join(parts)
+
+
+def _shortest(law: DelayLaw) -> int:
+    if isinstance(law, PerEpisode):
+        return _shortest(law.law)
+    if isinstance(law, Sum):
+        return _shortest(law.law) + _shortest(law.episode)
+    if isinstance(law, OwnLaw):
+        return law.later  # its own shortest is unknown
+    return law.steps if isinstance(law, Constant) else min(law.steps)  # type: ignore[attr-defined]  # all that remain
 
 
 def short_label(text: int | str) -> int | str:

@@ -64,6 +64,7 @@ class AdaptedPolicy:
     dt: float | None  # seconds a step; None if unknown
     action_delay: int  # the part of the ages that actions take to act
     idle: NDArray[Any]  # what acts before the first command, [A]
+    min_age: int  # the shortest age that it learned, in steps, after the start of an episode
 
     def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
         """Return the function's action, [A]."""
@@ -103,6 +104,7 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         delayed.step_seconds,
         delay.action.maximum,
         delayed.idle,
+        delay.minimum,
     )
 
 
@@ -180,7 +182,7 @@ def export_layers(
         "agent": agent,
         "env": name_of(env),
         "delay": delayed.delay.acted().label(),
-        "ages": [0, delta],
+        "ages": [policy.min_age, delta],
         "action_delay": policy.action_delay,
         "idle": [float(x) for x in policy.idle],
         "dt": policy.dt,

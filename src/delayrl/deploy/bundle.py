@@ -24,6 +24,7 @@ class Bundle:
         obs_size, action_size: S and A.
         low, high: the range of the actions, [A], in the task's units.
         max_age: Δ, the longest age that it takes, in steps.
+        min_age: the shortest that it learned, in steps, after the start of an episode; 0 if unknown.
         dt: seconds between two decisions; None if the task does not say.
         action_delay: the longest delay of actions in training, in steps, which is part of the age; 0 if unknown.
         idle: what acted in training before the first command, [A]; None if unknown.
@@ -38,9 +39,14 @@ class Bundle:
         self.max_age = network.max_age
         dt: Any = metadata.get("dt")
         self.dt = float(dt) if type(dt) in (int, float) and SHORTEST_STEP <= dt <= LONGEST_STEP else None
-        lag: Any = metadata.get("action_delay")
-        self.action_delay = lag if type(lag) is int and 0 <= lag <= network.max_age else 0
+        ages: Any = metadata.get("ages")
+        self.min_age = self._steps(ages[0] if isinstance(ages, list) and ages else 0)
+        self.action_delay = self._steps(metadata.get("action_delay"))
         self.idle = _idle(metadata.get("idle"), network.action_size)
+
+    def _steps(self, given: Any) -> int:
+        """Return a number of steps in a bundle.json; 0 if it has none, or something else."""
+        return given if type(given) is int and 0 <= given <= self.max_age else 0
 
     def __call__(self, obs: ArrayLike, actions: ArrayLike, age: int) -> NDArray[np.float32]:
         """Compute the deterministic action. Calls do not depend on each other.

@@ -43,7 +43,7 @@ def export_run(
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
     task = task_of(run, env)
     policy = restored(source, config, checkpoint, task, agent)
-    metadata = describe(source, checkpoint.step, policy.spec.delay, task)
+    metadata = describe(source, checkpoint.step, policy, task)
     write_files(Path(out), bundle_files(policy, metadata), force=force)
     return metadata
 
@@ -85,7 +85,7 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     return network, arrays
 
 
-def describe(run: RunFolder, step: int, longest: int, task: Task) -> dict[str, Any]:
+def describe(run: RunFolder, step: int, policy: Policy, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
     config = run.config
     env = make(task, trained_delay(run.path))
@@ -93,7 +93,7 @@ def describe(run: RunFolder, step: int, longest: int, task: Task) -> dict[str, A
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
         **{name: config.get(name) for name in copied},
-        "ages": [0, longest],
+        "ages": [policy.min_age(env.delay), policy.spec.delay],
         "action_delay": env.delay.action.maximum,
         "dt": seconds_of(env),
         "observation": space_json(env.observation_space),

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import itertools
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
 from delayrl.envs.making import check_limit, delay_of, make, name_of
 from delayrl.envs.task import Task, TaskLike, as_task
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.play.policy import Policy, load, spec_of, task_of, trained_delay
 from delayrl.run.agents import AgentLike
@@ -193,6 +194,7 @@ def evaluate(
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
     usual: DelayLike
+    learned = 0
     if isinstance(run, Policy):
         if env is None:
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
@@ -202,7 +204,12 @@ def evaluate(
     else:
         config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)
         policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
-    return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
+        learned = policy.min_age(usual)
+    result = _play(policy, name, task, usual if delay is None else delay, episodes, seed)
+    if delay is not None and delay_of(task, delay).minimum < learned:
+        line = f"{name} learned no age below {learned} steps, and delay {result['delay']} shows younger ones"
+        warnings.warn(f"{line}; a Controller holds these back", DelayWarning, stacklevel=2)
+    return result
 
 
 def sweep(

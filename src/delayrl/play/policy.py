@@ -54,6 +54,10 @@ class Policy:
 
         self._act = jax.jit(decide)
 
+    def min_age(self, trained: Delay) -> int:
+        """Return the shortest age that it learned under this delay, after the start of an episode, in steps."""
+        return 0 if getattr(self.agent, "every_age", False) else trained.minimum
+
     def act(self, obs: NDArray[Any], info: dict[str, Any]) -> NDArray[np.float32]:
         """Return the action, in the task's own units: the policy's mode, but a draw of agents whose evaluation samples.
 

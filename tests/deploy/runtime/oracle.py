@@ -32,6 +32,7 @@ class Setting:
     action_delay: int
     on_overrun: str
     idle: float | None
+    min_age: int = 0
     obs_size: int = 1
 
     @property
@@ -65,6 +66,7 @@ class Oracle:
     start: float | None = 0.0  # None until the first observation or command sets it
     # ("obs", stamp, content) | ("command", now, action) | ("fix", step, action), as far as they were accepted
     log: list[tuple[str, float, float]] = field(default_factory=list)
+    shown: float = -math.inf  # the stamp of the observation that was shown last in this episode
     tally: dict[str, int] = field(default_factory=dict)
     ages: list[int] = field(default_factory=list)
     delays: list[float] = field(default_factory=list)
@@ -136,8 +138,10 @@ class Oracle:
             verdict = "future"
         elif seen and stamp == max(seen)[0]:
             verdict = "duplicate"
-        elif seen and stamp < max(seen)[0]:
+        elif seen and stamp < (self.shown if self.setting.min_age else max(seen)[0]):
             verdict = "late"
+        elif self.setting.min_age and any(stamp == other for other, _ in seen):
+            verdict = "duplicate"
         else:
             verdict = "new"
             self.log.append(("obs", stamp, content))
@@ -154,13 +158,22 @@ class Oracle:
         self.forward(now)
         if not self.observations():
             raise DelayRLError
-        stamp, content = max(self.observations())
-        if stamp - now > self.setting.period / 2:
+        if max(self.observations())[0] - now > self.setting.period / 2:
             raise ClockError
         begins, actions, *_ = self.steps(now)
         past = self.steps()[1]
-        nearest = min(range(len(begins)), key=lambda j: (abs(begins[j] - stamp), -j))
-        step = min(nearest, len(begins) - 1 - self.setting.action_delay)
+
+        def step_of(stamp: float) -> int:
+            nearest = min(range(len(begins)), key=lambda j: (abs(begins[j] - stamp), -j))
+            return min(nearest, len(begins) - 1 - self.setting.action_delay)
+
+        waiting = sorted(seen for seen in self.observations() if seen[0] >= self.shown)  # the last shown too
+        old = [seen for seen in waiting if len(begins) - 1 - step_of(seen[0]) >= self.setting.min_age]
+        young = waiting[max(1, len(old)) :]
+        stamp, content = max(old) if old else min(waiting)
+        if young and len(begins) - 1 - step_of(stamp) > self.setting.max_age:
+            stamp, content = min(young)
+        self.shown, step = stamp, step_of(stamp)
         age = len(begins) - 1 - step
         if age > self.setting.max_age:
             self.count("overruns")
@@ -185,6 +198,7 @@ class Oracle:
         *_, missed, replaced = self.steps()
         self.missed, self.replaced = self.missed + missed, self.replaced + replaced
         self.episode, self.start, self.log = self.episode + 1, now if self.setting.seconds else 0.0, []
+        self.shown = -math.inf
 
 
 def play(setting: Setting, events: list[Event]) -> dict[str, int]:
@@ -195,6 +209,7 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
         policy,
         stamps="seconds" if setting.seconds else "steps",
         action_delay=setting.action_delay,
+        min_age=setting.min_age,
         on_overrun=setting.on_overrun,
         idle=None if setting.idle is None else [setting.idle],
         clock=lambda: world,
@@ -325,6 +340,7 @@ def draw_setting(rng: np.random.Generator) -> Setting:
         action_delay=int(rng.integers(0, min(2, max_age) + 1)) if rng.random() < 0.4 else 0,
         on_overrun=["hold", "clip", "raise"][rng.integers(3)],
         idle=None if rng.random() < 0.6 else 7.0,
+        min_age=int(rng.integers(1, max_age + 1)) if max_age and rng.random() < 0.4 else 0,
         obs_size=int(rng.integers(1, 3)),
     )
 

@@ -52,12 +52,13 @@ def test_100_000_random_event_sequences_against_the_oracle() -> None:
 
 
 SETTINGS = st.builds(
-    lambda seconds, age, κ, overrun, idle: Setting(seconds, age, min(κ, age), overrun, idle),
+    lambda seconds, age, κ, overrun, idle, held: Setting(seconds, age, min(κ, age), overrun, idle, min(held, age)),
     st.booleans(),
     st.integers(0, 4),
     st.integers(0, 2),
     st.sampled_from(["hold", "clip", "raise"]),
     st.sampled_from([None, 7.0]),
+    st.sampled_from([0, 0, 1, 3, 4]),
 )
 EVENTS = st.one_of(
     st.tuples(st.just("wait"), st.integers(-4, 24), st.just(0)),
@@ -129,6 +130,52 @@ def test_shows_what_the_wrapper_shows(stamps: str, delay: str, first: int) -> No
             np.testing.assert_array_equal(got_actions, info["actions"])
             assert got_age == info["age"]
             obs, _, _, _, info = env.step(action)
+
+
+@pytest.mark.parametrize("delay", ["uniform:1:4@wait", "uniform:0:3@wait+action=2"])
+def test_holds_back_as_the_wrapper_waits(delay: str) -> None:
+    """Messages overtake each other on the way; the policy is shown each once it has the longest delay."""
+    env = Delayed(gym.make("Pendulum-v1"), delay)
+    policy = Recorder(env, env.history)
+    lag = env.delay.action.maximum
+    controller = Controller(policy, action_delay=lag, min_age=env.delay.minimum, on_overrun="raise")
+    assert env.delay.minimum == env.delay.maximum
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        controller.reset()
+        obs, info = env.reset(seed=episode)
+        due: list[tuple[int, int, np.ndarray]] = []
+        for step in range(40):
+            travel = rng.integers(0, env.delay.observation.maximum + 1) if step else 0
+            due.append((step + travel, step, info["truth"]))
+            for arrival, k, values in due:
+                if arrival == step:
+                    assert controller.observe(values, k, step) == "new"
+            action = controller.act(step)
+            got_obs, got_actions, got_age = policy.shown[-1]
+            np.testing.assert_array_equal(got_obs, obs)
+            np.testing.assert_array_equal(got_actions, info["actions"])
+            assert got_age == info["age"]
+            obs, _, _, _, info = env.step(action)
+    assert (controller.statistics.age_min, controller.statistics.late) == (env.delay.maximum, 0)
+
+
+def test_what_is_held_back() -> None:
+    """The policy's own `min_age` counts. Of a slow sensor a younger one is shown, rather than one that is too old."""
+    policy = counting(4)
+    policy.min_age = 4
+    controller = Controller(policy)
+    assert controller.serves.endswith("; held back until 4 steps late")
+    for step in range(9):
+        if step % 2 == 0:
+            controller.observe([10.0 + step], step, step)
+        controller.act(step)
+    shown = [(obs - 10, age) for obs, _, age in policy.calls[1:]]  # the first call is of the constructor
+    assert shown == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (2, 3), (2, 4), (4, 3), (4, 4)]
+    assert controller.observe([0.0], 3) == "late"
+    assert controller.observe([0.0], 5) == "new"  # which has been overtaken, and is not too old yet
+    assert [controller.observe([0.0], k) for k in (5, 6)] == ["duplicate", "duplicate"]
+    assert controller.statistics.overruns == 0
 
 
 def counting(max_age: int = 3) -> Counting:
@@ -415,7 +462,9 @@ def test_mistakes_are_one_line_and_change_nothing(call, message: str) -> None:
         ({"stamps": "ticks"}, "in steps or in seconds"),
         ({"on_overrun": "panic"}, "hold, clip or raise"),
         ({"action_delay": -1}, "whole steps"),
-        ({"action_delay": 4}, "longest age, 3"),
+        ({"action_delay": 4}, "longest age 3"),
+        ({"min_age": 4}, "min_age is 4 steps, and the policy's longest age 3"),
+        ({"min_age": 1.0}, "min_age counts whole steps; got 1.0"),
         ({"dt": 0.1}, "steps have no length"),
         *(({"stamps": "seconds", "dt": dt}, "give dt") for dt in (0.0, "0.1", True, 1e-300, 1e7, math.nan)),
         ({"idle": [1.0, 2.0]}, "idle must be 1 finite"),

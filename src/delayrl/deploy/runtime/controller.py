@@ -83,6 +83,8 @@ class Controller:
         dt: seconds a step, for stamps in seconds; None for the policy's own.
         action_delay: steps from a command to its effect, κ, which is part of the age. None for the policy's own
             `action_delay`, or 0 if it has none.
+        min_age: steps that observations are held back for, so that the policy is shown no younger age than it knows;
+            the first of an episode is shown at once. None for the policy's own `min_age`, or 0 if it has none.
         on_overrun: what `act` does while the newest observation is too old for the policy; see `OnOverrun`.
         idle: what the plant does in a step without a command, [A]. None if it goes on with the action before. Before
             the first it then does the policy's own `idle`, or zeros if it has none, clipped to the range.
@@ -99,6 +101,7 @@ class Controller:
         stamps: Stamps = "steps",
         dt: float | None = None,
         action_delay: int | None = None,
+        min_age: int | None = None,
         on_overrun: OnOverrun = "hold",
         idle: ArrayLike | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -107,31 +110,31 @@ class Controller:
         if on_overrun not in get_args(OnOverrun):
             raise DelayRLError(f"on_overrun is hold, clip or raise; got {on_overrun!r}")
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
-        self.action_delay = _action_delay(policy, action_delay)
+        self.action_delay = _steps(policy, "action_delay", action_delay)
+        self.min_age = _steps(policy, "min_age", min_age)
         self._clock = Clock(stamps, getattr(policy, "dt", None) if stamps == "seconds" and dt is None else dt, clock)
         steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
-        own = getattr(policy, "idle", None)
-        first = np.zeros(policy.action_size) if own is None else own
-        first = _in_range(policy, _action(policy, first, "the policy's idle"))
+        first = _first_action(policy)
         capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
         self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
-        self._episode = Episode(0, 0.0 if stamps == "steps" else -np.inf, self._clock, self._history())
-        size = policy.action_size
-        shape = np.shape(policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, size), np.float32), 0))
-        if shape != (size,):
-            raise DelayRLError(f"the policy's action must be {size} numbers; got shape {shape}")
+        self._episode = self._new_episode(0, 0.0 if stamps == "steps" else -np.inf)
+        _try(policy)
+
+    def _new_episode(self, number: int, start: float) -> Episode:
+        return Episode(number, start, self._clock, self._history(), self.min_age, self.policy.max_age)
 
     @property
     def serves(self) -> str:
         """The delays of observations that the policy serves at this action delay, in words."""
-        return served(self.policy.max_age, self.action_delay, self._clock.period if self.stamps == "seconds" else None)
+        dt = self._clock.period if self.stamps == "seconds" else None
+        return served(self.min_age, self.policy.max_age, self.action_delay, dt)
 
     @property
     def ready(self) -> bool:
         """Whether an observation has arrived in this episode."""
-        return self._episode.obs is not None
+        return self._episode.ready
 
     @property
     def episode(self) -> int:
@@ -156,7 +159,7 @@ class Controller:
         """
         with self._act_lock, self._state_lock:
             start = 0.0 if self.stamps == "steps" else self._clock.now(now, 0)
-            self._episode = Episode(self.episode + 1, start, self._clock, self._history())
+            self._episode = self._new_episode(self.episode + 1, start)
 
     def observe(self, obs: ArrayLike, stamp: float, now: float | None = None, *, episode: int | None = None) -> Arrival:
         """Take in an observation. Call it for every one that arrives, in any order and as often as it arrives.
@@ -200,21 +203,21 @@ class Controller:
         with self._act_lock:
             with self._state_lock:
                 now = self._episode.command_time(now)
-                newest = self._episode.newest(now)
-                age = newest.age
+                shown = self._episode.shown(now)
+                age = shown.age
                 if age > limit:
                     self._telemetry.counts["overruns"] += 1
                     if self.on_overrun == "raise":
                         raise OverrunError(f"the policy takes ages 0..{limit}; the newest is {age} steps old")
-            if age <= limit or (self.on_overrun == "clip" and len(newest.actions) == age):
-                action = _decide(policy, newest.obs, newest.actions, min(age, limit))
+            if age <= limit or (self.on_overrun == "clip" and len(shown.actions) == age):
+                action = _decide(policy, shown.obs, shown.actions, min(age, limit))
             else:
-                action = _in_range(policy, newest.held)
+                action = _in_range(policy, shown.held)
             with self._state_lock:
                 period = self._episode.record(action, now)
                 self._telemetry.counts["decisions"] += 1
-                if newest.warm:
-                    self._telemetry.add(age, newest.delay, period)
+                if shown.warm:
+                    self._telemetry.add(age, shown.delay, period)
         return action.copy()
 
     def override(self, action: ArrayLike, now: float | None = None) -> None:
@@ -241,13 +244,28 @@ class Controller:
             return episode in (None, self.episode) and self._episode.history.correct(values, step)
 
 
-def _action_delay(policy: ControlPolicy, given: Any) -> int:
-    """Return the given action delay, or the policy's own. Raises DelayRLError if the policy cannot serve it."""
-    steps = getattr(policy, "action_delay", 0) if given is None else given
+def _first_action(policy: ControlPolicy) -> Action:
+    """Return what the plant does before the first command: the policy's own `idle`, or zeros; in its range, [A]."""
+    own = getattr(policy, "idle", None)
+    first = np.zeros(policy.action_size) if own is None else own
+    return _in_range(policy, _action(policy, first, "the policy's idle"))
+
+
+def _try(policy: ControlPolicy) -> None:
+    """Call a policy at age 0. Raises DelayRLError if its action has another size."""
+    size = policy.action_size
+    shape = np.shape(policy(np.zeros(policy.obs_size), np.zeros((policy.max_age, size), np.float32), 0))
+    if shape != (size,):
+        raise DelayRLError(f"the policy's action must be {size} numbers; got shape {shape}")
+
+
+def _steps(policy: ControlPolicy, name: str, given: Any) -> int:
+    """Return the given `action_delay` or `min_age`, or the policy's own. Raises DelayRLError if it cannot serve it."""
+    steps = getattr(policy, name, 0) if given is None else given
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 0:
-        raise DelayRLError(f"action_delay counts whole steps; got {steps!r}")
+        raise DelayRLError(f"{name} counts whole steps; got {steps!r}")
     if steps > policy.max_age:
-        raise DelayRLError(f"an action delay of {steps} steps is above the policy's longest age, {policy.max_age}")
+        raise DelayRLError(f"{name} is {steps} steps, and the policy's longest age {policy.max_age}")
     return int(steps)
 
 

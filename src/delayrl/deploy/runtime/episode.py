@@ -1,10 +1,11 @@
-"""The state of one episode: its times, the steps that the plant has gone through, and the newest observation.
+"""The state of one episode: its times, the steps that the plant has gone through, and what has been observed.
 
 Steps are numbered from the start of the episode. Only the newest ones are remembered.
 """
 
 import math
 import operator
+from bisect import bisect_right, insort
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
@@ -20,6 +21,8 @@ Arrival = Literal["new", "late", "duplicate", "invalid", "future"]
 """What became of an observation; see `Statistics`. Only new ones are used."""
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 1e6
 """Bounds of a step, in seconds."""
+MOST_HELD = 10_000
+"""How many observations are held back at most."""
 LARGEST_TIME = 1e15
 """The largest distance from 0, in steps or seconds. Beyond it, floating point cannot tell neighbouring times apart."""
 
@@ -163,8 +166,8 @@ class History:
         return self._actions[-1] if self._actions else self._first
 
 
-class Newest(NamedTuple):
-    """The newest observation, seen from a command."""
+class Shown(NamedTuple):
+    """The observation that a command is chosen on, seen from that command."""
 
     obs: NDArray[np.float64]
     age: int
@@ -175,22 +178,39 @@ class Newest(NamedTuple):
 
 
 class Episode:
-    """Judge observations and record commands. A start of -inf leaves it to the first observation or command."""
+    """Judge observations and record commands.
 
-    def __init__(self, number: int, start: float, clock: Clock, history: History) -> None:
+    Args:
+        number: of the episode.
+        start: when it began; -inf leaves that to the first observation or command.
+        clock: checks times.
+        history: of the steps.
+        min_age: steps that observations are held back for.
+        max_age: the policy's longest age; an observation is held back only as long as that leaves one to show.
+    """
+
+    def __init__(self, number: int, start: float, clock: Clock, history: History, min_age: int, max_age: int) -> None:
         self.number, self.history = number, history
-        self._start, self._clock = start, clock
-        self.obs: NDArray[np.float64] | None = None  # the newest
-        self._stamp = self._last_command = -math.inf
+        self._start, self._clock, self._min_age, self._max_age = start, clock, min_age, max_age
+        self._kept: list[tuple[float, NDArray[np.float64]]] = []  # the one to show and those held back, by their stamps
+        self._oldest = self._last_command = -math.inf  # the stamp that those to come must not be older than
         self._first_command: int | None = None  # in steps from the start
 
+    @property
+    def ready(self) -> bool:
+        """Whether an observation has arrived."""
+        return bool(self._kept)
+
     def observe(self, obs: NDArray[np.float64], stamp: float, now: float | None, episode: int | None) -> Arrival:
-        """Keep an observation if it is the newest; return what became of it."""
+        """Keep an observation if it is the newest, or to be held back; return what became of it."""
         arrival = self._judge(obs, stamp, now, episode)
         if arrival == "new":
-            self.obs, self._stamp = obs, stamp
+            insort(self._kept, (stamp, obs), key=_stamp)
             if self._start == -math.inf:
                 self._start = stamp
+            if not self._min_age:
+                self._oldest = stamp
+            del self._kept[: -MOST_HELD if self._min_age else -1]
         return arrival
 
     def command_time(self, now: float | None) -> float:
@@ -203,18 +223,26 @@ class Episode:
             raise ClockError(f"steps count from 0; now is {time:g}")
         return time
 
-    def newest(self, now: float) -> Newest:
-        """Return the newest observation with its age. Raises DelayRLError if none has arrived before `now`."""
-        if self.obs is None:
+    def shown(self, now: float) -> Shown:
+        """Return the observation to show, with its age. Raises DelayRLError if none has arrived before `now`."""
+        if not self._kept:
             hint = "wait until `controller.ready`; `statistics` counts what was refused"
             raise DelayRLError(f"this episode has no observation: {hint}")
-        if self._stamp > now + self._clock.period / 2:
-            newest = f"the newest observation, made at {self._stamp:g}"
-            raise ClockError(f"now is {now:g}, more than half a step before {newest}")
+        if (newest := self._kept[-1][0]) > now + self._clock.period / 2:
+            raise ClockError(f"now is {now:g}, more than half a step before the newest observation, made at {newest:g}")
         elapsed = self._elapsed(now)
-        step, age, actions = self.history.age(self._stamp, now, elapsed)
+
+        def age(kept: tuple[float, Any]) -> int:
+            return self.history.age(kept[0], now, elapsed)[1]
+
+        if len(self._kept) > 1:
+            index = max(0, bisect_right(self._kept, -self._min_age, key=lambda kept: -age(kept)) - 1)
+            index += index + 1 < len(self._kept) and age(self._kept[index]) > self._max_age
+            del self._kept[:index]
+        self._oldest, obs = self._kept[0]
+        step, shown_age, actions = self.history.age(self._oldest, now, elapsed)
         warm = self._first_command is not None and step > self._first_command
-        return Newest(self.obs.copy(), age, actions, now - self._stamp, warm, self.history.held(now, elapsed))
+        return Shown(obs.copy(), shown_age, actions, now - self._oldest, warm, self.history.held(now, elapsed))
 
     def record(self, action: Action, now: float) -> float:
         """Add a command to the history. Returns the time since the last one, infinite for the first."""
@@ -236,9 +264,9 @@ class Episode:
             return "late"
         if stamp > self._now(now) + self._clock.period / 2:
             return "future"
-        if stamp == self._stamp:
+        if any(stamp == kept for kept, _ in self._kept):
             return "duplicate"
-        return "late" if stamp < self._stamp else "new"
+        return "late" if stamp < self._oldest else "new"
 
     def _now(self, now: float | None) -> float:
         return self._clock.now(now, max(0, self.history.length - self.history.lead))
@@ -246,3 +274,7 @@ class Episode:
     def _elapsed(self, now: float) -> int:
         """Return the steps from the start to `now`: none of them had a command if the first is given then."""
         return max(0, math.floor((now - self._start) / self._clock.period + 0.5))
+
+
+def _stamp(kept: tuple[float, NDArray[np.float64]]) -> float:
+    return kept[0]

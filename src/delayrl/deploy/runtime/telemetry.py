@@ -31,9 +31,9 @@ class Statistics:
     missed: int  # steps without a command of their own
     replaced: int  # commands that another one replaced less than half a period later
     overridden: int  # commands that somebody else gave
-    new: int  # observations that were used, each the newest when it arrived
-    late: int  # observations older than the newest, or of another episode
-    duplicate: int  # observations with the stamp of the newest
+    new: int  # observations that were the newest when they arrived, or held back
+    late: int  # observations older than the newest, or, with `min_age`, than the last shown; or of another episode
+    duplicate: int  # observations with the stamp of the newest, or of one held back
     invalid: int  # observations not finite in single precision, or with a stamp beyond ±1e15 or a step below 0
     future: int  # observations stamped more than half a period after they arrived
 
@@ -83,21 +83,24 @@ class Telemetry:
         return Statistics(**self.counts, **moments, **ages)
 
 
-def served(max_age: int, action_delay: int, dt: float | None) -> str:
+def served(min_age: int, max_age: int, action_delay: int, dt: float | None) -> str:
     """Say which delays of the observations a policy serves.
 
     Ages are rounded to steps, so a sensor at any phase of the control loop takes half a step of them
     (`delayrl.delays.any_phase`).
 
     Args:
-        max_age: the longest age, in steps.
+        min_age: the age that observations are held back for, in steps.
+        max_age: the longest age.
         action_delay: the part of it that commands take to act.
         dt: seconds a step; None if unknown.
     """
     steps = max_age - action_delay
 
     def late(steps: float) -> str:
-        return f"up to {steps:g} steps late" if dt is None else f"up to {1000 * steps * dt:.4g} ms late"
+        whole = f"{steps:g} step{'s' * (steps != 1)}"
+        return f"{whole if dt is None else f'{1000 * steps * dt:.4g} ms'} late"
 
-    phases = f"{late(steps - 0.5)} at any phase" if steps else "none at another phase"
-    return f"observations {late(steps)} from a sensor in step with the control loop, {phases}"
+    phases = f"up to {late(steps - 0.5)} at any phase" if steps else "none at another phase"
+    held = f"; held back until {late(min_age - action_delay)}" if min_age > action_delay else ""
+    return f"observations up to {late(steps)} from a sensor in step with the control loop, {phases}{held}"
