@@ -39,7 +39,7 @@ def section(files: list[Path], env: str = ENV) -> str:
     about += "the other. § stays clear after Holm's correction for all differences of its column. *Critics* are "
     about += "any-age's: with layer normalisation, or plain (`critic_norm=none`) beside agents without it."
     if "†" in rows:
-        about += " † reads the true state while it trains; VDPO has `--tokens 1280`."
+        about += " † acts on the true state while it trains; VDPO has `--tokens 1280`."
     return f"{rows}\n\n{about}"
 
 

@@ -266,6 +266,28 @@ def overruns_table(lines: list[dict[str, Any]]) -> str:
     return f"{markdown_table(['travel time, steps', '`clip`', '`hold`', 'the last Δ actions'], body)}\n\n{about}"
 
 
+def younger_table(lines: list[dict[str, Any]]) -> str:
+    """Return a Markdown table of mean returns at younger ages than were learned, held back and not."""
+    policy, versions, rows = lines[0]["policy"], lines[0]["versions"], lines[1:]
+    body: list[list[str]] = []
+    travels = list(dict.fromkeys((row["link"]["low"], row["link"]["high"]) for row in rows))
+    for low, high in travels:
+        played = [row for row in rows if (row["link"]["low"], row["link"]["high"]) == (low, high)]
+        cells = []
+        for at_once in (False, True):
+            means = [np.mean(row["returns"]) for row in played if (row["min_age"] == 0) == at_once]
+            cells.append(f"{np.mean(means):,.0f} ± {np.std(means, ddof=1):,.0f}")
+        body.append([f"{low} to {high}" if low < high else f"{low}", *cells])
+    seeds = len({row["seed"] for row in rows})
+    about = (
+        f"{policy['env']}; `{policy['agent']}` trained with delay {policy['delay']}, preset `{policy['preset']}`, "
+        f"{policy['schedule']['steps']:,} steps, {seeds} seeds, {len(rows[0]['returns'])} episodes each; ± is the standard "
+        f"deviation over seeds. MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: "
+        "`benchmarks/results/younger.jsonl`."
+    )
+    return f"{markdown_table(['travel time, steps', 'held back', 'shown at once (`min_age=0`)'], body)}\n\n{about}"
+
+
 def insert(page: Path, key: str, text: str) -> None:
     """Replace the text between `<!-- key -->` and `<!-- /key -->` in a page."""
     content = page.read_text()
@@ -309,8 +331,8 @@ def main() -> None:
         shown = {agent: COLOURS[agent] for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
         sweeps.draw(sweeps.read(HERE / "results" / "pusher-random.jsonl"), title, images / "pusher-delays.png", shown)
     for name, pages in {
-        "pendulum": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
-        "reacher": ["docs/algorithms/vdpo.md", "docs/benchmarks.md"],
+        "pendulum": ["docs/benchmarks.md"],
+        "reacher": ["docs/benchmarks.md"],
         "walk": ["docs/benchmarks.md"],
         "walk-random": ["docs/benchmarks.md"],
         "pusher-random": ["docs/delays.md"],
@@ -321,10 +343,11 @@ def main() -> None:
     insert(root / "docs" / "protocols.md", "entropies", entropies("pusher-entropy"))
     if (HERE / "results" / "overhead.jsonl").exists():
         insert(root / "docs" / "delays.md", "overhead", overhead())
-    udp, overruns = (
+    udp, overruns, younger = (
         [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
-        for name in ("udp", "overruns")
+        for name in ("udp", "overruns", "younger")
     )
+    insert(root / "docs" / "runtime.md", "younger", younger_table(younger))
     insert(root / "docs" / "runtime.md", "overruns", overruns_table(overruns))
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]

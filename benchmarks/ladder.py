@@ -144,7 +144,8 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
     arms, slower = {name(r): r for r in results}, slower or {}
     base = arms.get(BASE)
     head = ["arm", "seeds", "over training", "times BPQL's", "minus BPQL's"]
-    head += ["`any-age` minus this arm, by seed", "at the end", f"above {AWAY:,}", "GFLOP", "update time / BPQL's"]
+    head += ["`any-age` (with such batches) minus this arm, by seed", "at the end", f"above {AWAY:,}", "GFLOP"]
+    head += ["update time / BPQL's"]
     body = []
     for result in results:
         own, final, other = area(result), result.curves.final, area(base) if base and base is not result else None

@@ -5,18 +5,26 @@ The policies are of one agent that learned the age of its constant delay alone, 
 
 import argparse
 import json
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from overruns import EPISODES, Link, RunPolicy, returns
+from overruns import Link, returns
 
-from delayrl.deploy import Controller
+from delayrl.deploy import Bundle, Controller, export_run, load_bundle
 from delayrl.run.provenance import versions
 
 TRAVELS = ((0, 0), (1, 1), (2, 2), (3, 3), (4, 4), (5, 5), (3, 5), (0, 5))
+
+
+def exported(run: Path) -> Bundle:
+    """Return the policy of a run as it is deployed, in NumPy."""
+    with tempfile.TemporaryDirectory() as folder:
+        export_run(run, Path(folder) / "bundle")
+        return load_bundle(Path(folder) / "bundle")
 
 
 def main() -> None:
@@ -25,17 +33,17 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
     parser.add_argument("--out", type=Path, required=True, help="the file of the rows")
     given = parser.parse_args()
+    policies = [exported(run) for run in given.runs]
     configs = [json.loads((run / "config.json").read_text()) for run in given.runs]
     kept = ("agent", "env", "delay", "preset", "schedule", "hyperparameters")
-    policies = {config["seed"]: RunPolicy(run) for run, config in zip(given.runs, configs, strict=True)}
     lines: list[dict[str, Any]] = [{"policy": {name: configs[0][name] for name in kept}, "versions": versions()}]
     env = gym.make(configs[0]["env"])
     for link in (Link(low, high) for low, high in TRAVELS):
-        for seed, policy in policies.items():
-            for min_age in (0, policy.max_age):
+        for policy, config in zip(policies, configs, strict=True):
+            for min_age in (0, policy.min_age):
                 totals = returns(env, Controller(policy, min_age=min_age), link)
-                lines.append({"link": asdict(link), "seed": seed, "min_age": min_age, "returns": totals})
-            print(link, seed, [round(np.mean(line["returns"])) for line in lines[-2:]], EPISODES, flush=True)
+                lines.append({"link": asdict(link), "seed": config["seed"], "min_age": min_age, "returns": totals})
+            print(link, config["seed"], [round(np.mean(line["returns"])) for line in lines[-2:]], flush=True)
     given.out.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 

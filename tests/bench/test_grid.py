@@ -234,6 +234,7 @@ BAD = [
     (BASIC + "[overrides.dcac]\nhidden = [8]\n", "overrides of dcac, which is not among the agents bpql, a-sac"),
     (BASIC + "[[product]]\n[product.overrides.vdpo]\nwidth = 8\n", "product 1: there are overrides of vdpo, which is"),
     (BASIC + "[overrides]\nwidth = 3\n", "unknown hyperparameter 'width'"),
+    (BASIC + "[overrides]\nbpql = 3\n", "unknown hyperparameter 'bpql'"),
     (BASIC + "[[product]]\n[product.overrides]\nwidth = 3\n", "product 1: unknown hyperparameter 'width'"),
     (BASIC + "[overrides]\nsteps = 900\n", "nothing would be learned: the first update is at step 1,000"),
     (BASIC + "[overrides]\nreplay_capacity = 5\n", "replay_capacity must be at least"),

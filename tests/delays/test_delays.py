@@ -174,6 +174,8 @@ def test_recorded_files(tmp_path: Path) -> None:
     (tmp_path / "b.csv").write_text("sent,delay\n0.00,0.010\n0.02,0.041\n0.04,0.040\n")
     (tmp_path / "c.txt").write_text("3\n1\n4\n")
     assert recorded(tmp_path / "a.npy") == recorded(tmp_path / "c.txt") == Recorded((3, 1, 4))
+    with pytest.raises(DelayRLError, match=r"no unit.*got 'us'"):
+        recorded(tmp_path / "b.csv", 0.02, "us")
     assert recorded(tmp_path / "b.csv", 0.02, "s") == Recorded((1, 3, 2))  # 41 ms are seen at the third step
     assert as_delay(f"recorded:{tmp_path / 'b.csv'}:s", 0.02).observation.law == Recorded((1, 3, 2))
     long = Delay(Channel(Recorded(tuple(range(30)) * 3)))

@@ -17,6 +17,7 @@ from bundles import bundle_of, policy_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from delayrl import deploy
 from delayrl.cli.main import main
 from delayrl.deploy import Bundle, load_bundle
 from delayrl.deploy.backends.network import parse
@@ -93,6 +94,16 @@ def test_no_bundle(tmp_path: Path, original: Path) -> None:
     refused(original / WEIGHTS, "not a folder")
     with pytest.raises(DelayRLError, match="unknown backend 'torch'; there are numpy, onnx, jax"):
         load_bundle(original, "torch")
+
+
+@pytest.mark.parametrize(("module", "error"), [("jax.numpy", DelayRLError), ("arm", ModuleNotFoundError)])
+def test_an_extra_that_is_not_installed(module: str, error: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacks(name: str) -> None:
+        raise ModuleNotFoundError(name=module)
+
+    monkeypatch.setattr(deploy, "import_module", lacks)
+    with pytest.raises(error, match="train" if error is DelayRLError else None):
+        deploy.export_run  # noqa: B018
 
 
 def test_a_backend_that_is_not_installed(original: Path, monkeypatch: pytest.MonkeyPatch) -> None:

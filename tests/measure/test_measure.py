@@ -713,6 +713,7 @@ def test_command_for_environments(tmp_path: Path, monkeypatch, capsys: pytest.Ca
     ):
         assert words in refused(capsys, target)
     assert "--period is an option of a log" in refused(capsys, "Pendulum-v1", "--period", "20ms")
+    assert "--warm-up is an option of a log" in refused(capsys, "Pendulum-v1", "--warm-up", "0s")
     assert "count from 1" in refused(capsys, "Pendulum-v1", "--episodes", "0")
     assert "counts steps" in refused(capsys, "Pendulum-v1", "--longest", "1s")
 

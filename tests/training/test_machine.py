@@ -20,7 +20,7 @@ def test_containers_have_less(monkeypatch: pytest.MonkeyPatch) -> None:
     whole, free = machine.cores(), machine.free_memory()
     says = {"cpu.max": "250000 100000", "memory.max": str(2**30), "memory.current": str(2**29)}
     says["memory.stat"] = "file 7\ninactive_file 1024\nactive_file 7"
-    monkeypatch.setattr(machine, "limit", says.get)
+    monkeypatch.setattr(machine, "control_group", says.get)
     assert machine.cores() == min(whole, 2)
     assert machine.free_memory() == 2**29 + 1024
     says["cpu.max"] = "50000 100000"
@@ -34,7 +34,7 @@ def test_containers_have_less(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_several_seeds_are_told_how_they_would_be_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "entry_points", lambda group: [])
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4, 6})
-    monkeypatch.setattr(machine, "limit", lambda name: "")
+    monkeypatch.setattr(machine, "control_group", lambda name: "")
     assert machine.shared(5, device="cpu").startswith("seeds: 5 share one process; 2 processes of one core each")
     assert machine.shared(1, device=None) == ""
     monkeypatch.setattr(machine, "entry_points", lambda group: ["cuda"])

@@ -19,6 +19,7 @@ from delayrl.bench.grid import load_grid
 from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
 from delayrl.errors import DelayRLError
+from delayrl.measure import probe
 from delayrl.play.evaluation import evaluate
 from delayrl.run.condition import resolve
 from delayrl.run.folder import RunFolder
@@ -81,12 +82,15 @@ def test_environments_are_closed(tmp_path: Path) -> None:
 
         def close(self) -> None:
             open_now.discard(id(self))
+            raise RuntimeError("the port is gone")
 
     held = lambda: gym.wrappers.TimeLimit(Held(), 50)  # noqa: E731
     run = train("bpql", tmp_path / "run", env=held, seeds=2)[0]
     assert not open_now
     evaluate(run, 2, env=held)
     delayrl.load(run, held)
+    delayrl.export_run(run, tmp_path / "bundle", env=held)
+    probe(held, episodes=2)
     assert not open_now
 
     def two_at_most() -> gym.Env:

@@ -175,10 +175,14 @@ def test_damaged_configuration(tmp_path: Path) -> None:
     """Wrong types and missing names are one line."""
     run = train("random", tmp_path / "run", steps=120)
     good = run.config
-    for change in ({"agent": ["vdpo"]}, {"env": 3}, {"delay": None}, {"schedule": None}, {"hyperparameters": 7}):
+    missing = ({name: None} for name in ("protocol", "seed", "delay", "schedule"))
+    for change in ({"agent": ["vdpo"]}, {"env": 3}, {"hyperparameters": 7}, *missing):
         (run.path / "config.json").write_text(json.dumps(good | change))
         with pytest.raises(delayrl.DelayRLError, match="damaged"):
             delayrl.load(run.path)
+    (run.path / "config.json").write_text(json.dumps(good | {"preset": "tiny"}))
+    with pytest.raises(delayrl.DelayRLError, match="unknown preset 'tiny'"):
+        delayrl.go_on(run.path, 200)
 
 
 def test_agents_check_the_schedule(tmp_path: Path) -> None:

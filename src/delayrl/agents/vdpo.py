@@ -25,7 +25,7 @@ from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import gaussian_kl, masked_mean
 from delayrl.core.transformer import transformer, transformer_init
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
-from delayrl.core.views import view
+from delayrl.core.views import input_size, view
 from delayrl.errors import DelayRLError
 
 Representation = Literal["transformer", "transformer-no-belief", "mlp"]
@@ -103,7 +103,7 @@ class VDPO:
             raise DelayRLError("vdpo learns a policy for a delay of at least 1 step: give --delay N, or train sac")
         reference_key, encoder_key, decoder_key, head_key = jax.random.split(key, 4)
         encoder: Params = {}
-        features = spec.obs_size + spec.delay * spec.action_size + 1
+        features = input_size(spec, "augmented")
         if self.representation != "mlp":
             sizes = (spec.obs_size, spec.action_size, spec.delay, self.width, self.layers)
             encoder, features = transformer_init(encoder_key, *sizes), self.width

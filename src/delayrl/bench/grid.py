@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from delayrl.envs.making import make
-from delayrl.envs.task import as_task
+from delayrl.envs.task import as_task, closing
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
@@ -124,22 +124,20 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
         line = f"{unused} is for the grid's own products, and it has none"
         raise DelayRLError(f"{line}; the cells it includes keep theirs")
     shared: dict[str, Any] = DEFAULTS | {key: value for key, value in table.items() if key in PRODUCT}
+    every: list[str] = []
     for number, item in enumerate(products, 1):
         try:
             _check_keys(item, PRODUCT, "a product")
             own = item.get("overrides", {})
-            cells += _cells(shared | item | {"overrides": _merge(shared["overrides"], own)})
-            _check_overrides(own, item.get("agents", shared.get("agents", [])))
-            _check_tables(own, item.get("agents", shared.get("agents", [])))
+            whole = shared | item | {"overrides": _merge(shared["overrides"], own)}
+            cells += _cells(whole)
+            _check_overrides(own, whole["agents"])
+            every += whole["agents"]
         except DelayRLError as error:
             raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
     if not cells:
         raise DelayRLError("there are no products, so nothing to run")
-    if products:
-        lists = [item.get("agents", shared.get("agents", [])) for item in products]
-        every = [agent for agents in lists for agent in agents]
-        _check_overrides(shared["overrides"], every)
-        _check_tables(shared["overrides"], every)
+    _check_overrides(shared["overrides"], every)
     return cells
 
 
@@ -164,14 +162,10 @@ def _merge(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_overrides(overrides: Mapping[str, Any], agents: Sequence[str]) -> None:
-    """Raise DelayRLError for an override of all agents that none of them has."""
+    """Raise DelayRLError for an override that would be ignored: of no agent's option, or of an agent not there."""
     presets = [preset for agent in agents for preset in find_agent(agent).presets.values()]
     names = [name for name, value in overrides.items() if not isinstance(value, dict)]
     check_names(names, *(config for preset in presets for config in preset))
-
-
-def _check_tables(overrides: Mapping[str, Any], agents: Sequence[str]) -> None:
-    """Raise DelayRLError for a table of overrides of an agent that is not there: it would be ignored."""
     for name, value in overrides.items():
         if isinstance(value, dict) and name not in agents:
             raise DelayRLError(f"there are overrides of {name}, which is not among the agents {', '.join(agents)}")
@@ -191,14 +185,15 @@ def _cells(table: dict[str, Any]) -> Iterator[Planned]:
         for item in table[key]:
             if not isinstance(item, kind) or isinstance(item, bool):
                 raise DelayRLError(f"{key} cannot hold {item!r}")
-    for agent in [*table["agents"], *(name for name, value in table["overrides"].items() if isinstance(value, dict))]:
+    tables = {name: value for name, value in table["overrides"].items() if isinstance(value, dict)}
+    for agent in [*table["agents"], *tables]:
         find_agent(agent)
-    shared = {name: value for name, value in table["overrides"].items() if not isinstance(value, dict)}
+    shared = {name: value for name, value in table["overrides"].items() if name not in tables}
     groups = _seed_groups(table["seeds"], table.get("lockstep"))
     around = table.get("env_kwargs"), table.get("wrappers", ()), table.get("flatten", False)
     tasks = [str(as_task(env, *around)) for env in table["tasks"]]
     for env, delay, agent in product(tasks, table["delays"], table["agents"]):
-        overrides = json.dumps(_applicable(shared, agent) | table["overrides"].get(agent, {}), default=str)
+        overrides = json.dumps(_applicable(shared, agent) | tables.get(agent, {}), default=str)
         try:
             setup, replay_bytes = _setup(agent, env, delay, table["preset"], table["protocol"], overrides)
         except DelayRLError as error:
@@ -228,11 +223,9 @@ def _seed_groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int
 def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str, overrides: str) -> tuple[Setup, int]:
     """Resolve a condition. Returns the bytes of a seed's replay too. Raises DelayRLError if it cannot be trained."""
     setup = resolve(agent, env, delay, preset, protocol, json.loads(overrides))
-    task = make(env, setup.delay.observed())
-    check_fit(setup, task)
-    size = replay_bytes(setup, spec_of(task))
-    task.close()
-    return setup, size
+    with closing(make(env, setup.delay.observed())) as task:
+        check_fit(setup, task)
+        return setup, replay_bytes(setup, spec_of(task))
 
 
 def _check_overlap(cells: list[Planned]) -> None:

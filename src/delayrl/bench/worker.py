@@ -53,6 +53,7 @@ def work(folder: Path, device: str | None = None) -> Outcome:
     except LockedError:
         return Outcome("locked", "another process works on it")
     except DelayRLError as error:
+        _log(str(error))
         return Outcome("failed", str(error))
     except Exception as error:
         _log(traceback.format_exc())
@@ -63,7 +64,8 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
     seeds = tuple(cell["seeds"])
     step, complete = stored(folder, seeds)
     if complete:
-        if not any(event["event"] == "done" for event in journal(folder)[-1:]):
+        events = journal(folder)
+        if not events or events[-1]["event"] != "done":
             note(folder, "done")  # the worker that finished it was killed before it noted that
         return Outcome("done", "")
     from delayrl.training.train import train  # it sets JAX up: nothing here may start it before
@@ -78,9 +80,6 @@ def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:
     except StoppedError as error:
         note(folder, "stopped", step=stored(folder, seeds)[0])
         return Outcome("stopped", str(error))
-    except DelayRLError as error:
-        _log(str(error))
-        return Outcome("failed", str(error))
 
 
 def _log(text: str) -> None:

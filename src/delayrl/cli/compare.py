@@ -23,14 +23,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Print the options that differ and the returns, and draw the learning curves."""
     from delayrl.play.plots import curves
-    from delayrl.play.run import seed_runs
+    from delayrl.play.run import Run
     from delayrl.report.statistics import FEWEST, area, common_steps, mean_interval
+    from delayrl.run.folder import seed_folders
 
     if not 2 <= len(given.runs) <= len(LABELS):
         raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")
     if given.out.suffix not in (".png", ".pdf", ".svg"):
         raise DelayRLError(f"--out must end in .png, .pdf or .svg; got {given.out}")
-    groups = [seed_runs(path) for path in given.runs]
+    groups = [[Run(folder.path) for folder in seed_folders(path)] for path in given.runs]
     for path, group in zip(given.runs, groups, strict=True):
         if apart := differences([one.config for one in group]):
             names = ", ".join(name for name, *_ in apart)

@@ -200,6 +200,7 @@ def _plural(count: int, word: str) -> str:
 def _refuse(given: argparse.Namespace, names: tuple[str, ...], of: str, target: str) -> None:
     """Raise DelayRLError if an option was given that the target does not have."""
     for name in names:
-        if getattr(given, name) not in (None, [], False):
+        value = getattr(given, name)
+        if value is not None and value is not False and value != []:
             option = "wrapper" if name == "wrappers" else name.replace("_", "-")
             raise DelayRLError(f"--{option} is an option of {of}; {given.target} is taken for {target}")

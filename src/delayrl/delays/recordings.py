@@ -24,6 +24,8 @@ def recorded(path: str | Path, step_seconds: float | None = None, unit: str = ""
         DelayRLError: a missing or empty file, several columns without a header, or a value that is not a finite number
             of at least 0.
     """
+    if unit not in ("", "s", "ms"):
+        raise DelayRLError(f"recorded delays are in steps (no unit), s or ms; got {unit!r}")
     try:
         path = Path(path).expanduser()
         cells = _cells(path)

@@ -12,6 +12,7 @@ from delayrl.deploy.runtime.controller import ControlPolicy as ControlPolicy
 from delayrl.deploy.runtime.controller import OverrunError as OverrunError
 from delayrl.deploy.runtime.episode import ClockError as ClockError
 from delayrl.deploy.runtime.telemetry import Statistics as Statistics
+from delayrl.errors import needs_extra
 
 if TYPE_CHECKING:
     from delayrl.deploy.adapter import AdaptedPolicy as AdaptedPolicy
@@ -30,5 +31,8 @@ LATER = {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"} | 
 
 def __getattr__(name: str) -> Any:
     if module := LATER.get(name):
-        return getattr(import_module(f"delayrl.deploy.{module}"), name)
+        try:
+            return getattr(import_module(f"delayrl.deploy.{module}"), name)
+        except ModuleNotFoundError as error:
+            raise (needs_extra(error) or error) from error
     raise AttributeError(f"module 'delayrl.deploy' has no attribute {name!r}")

@@ -9,7 +9,7 @@ from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import pack, space_json
 from delayrl.envs.making import make, seconds_of
-from delayrl.envs.task import Task, TaskLike
+from delayrl.envs.task import Task, TaskLike, closing
 from delayrl.play.policy import Policy, restored, task_of, trained_delay
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
@@ -43,7 +43,7 @@ def export_run(
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
     task = task_of(run, env)
     policy = restored(source, config, checkpoint, task, agent)
-    metadata = describe(source, checkpoint.step, policy, task)
+    metadata = describe(source, config, checkpoint.step, policy, task)
     write_files(Path(out), bundle_files(policy, metadata), force=force)
     return metadata
 
@@ -85,17 +85,16 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     return network, arrays
 
 
-def describe(run: RunFolder, step: int, policy: Policy, task: Task) -> dict[str, Any]:
+def describe(run: RunFolder, config: dict[str, Any], step: int, policy: Policy, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
-    config = run.config
-    env = make(task, trained_delay(run.path))
-    env.close()
+    with closing(make(task, trained_delay(run.path))) as env:
+        seconds = seconds_of(env)
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
         **{name: config.get(name) for name in copied},
         "ages": [policy.min_age(env.delay), policy.spec.delay],
         "action_delay": env.delay.action.maximum,
-        "dt": seconds_of(env),
+        "dt": seconds,
         "observation": space_json(env.observation_space),
         "action": space_json(env.action_space),
         "normalisation": {
@@ -105,13 +104,13 @@ def describe(run: RunFolder, step: int, policy: Policy, task: Task) -> dict[str,
             "action": "inside, low .. high is -1 .. 1; the bundle takes and gives the task's own units",
         },
         "step": step,
-        "evaluation": _evaluation(run, step),
+        "evaluation": _evaluation(run, config, step),
         "trained_with": config.get("versions"),
         "exported_with": versions(),
     }
 
 
-def _evaluation(run: RunFolder, step: int) -> dict[str, Any] | None:
+def _evaluation(run: RunFolder, config: dict[str, Any], step: int) -> dict[str, Any] | None:
     """Summarise the last evaluation up to the checkpoint at `step`; None if there was none."""
     rows = [row for row in run.read("rows") if row["policy"] == "agent" and row["step"] <= step]
     if not rows:
@@ -119,4 +118,4 @@ def _evaluation(run: RunFolder, step: int) -> dict[str, Any] | None:
     last = max(row["step"] for row in rows)
     returns = [row["return"] for row in rows if row["step"] == last]
     moments = {"mean_return": float(np.mean(returns)), "std_return": deviation(returns)}
-    return {"step": last, "episodes": len(returns), **moments, "protocol": run.config.get("protocol")}
+    return {"step": last, "episodes": len(returns), **moments, "protocol": config.get("protocol")}

@@ -30,7 +30,7 @@ def find_id(name: str) -> str:
     raise DelayRLError(f"unknown task {name!r}; {hint}")
 
 
-def find_object(name: str) -> Any:
+def find_maker(name: str) -> Any:
     """Import what `module:object` names: a class or function, or the id of a task that the module registers.
 
     The working folder is searched too, as `python -m` does.
@@ -68,12 +68,12 @@ def find_stored(name: str, folder: Path) -> Any:
     choice that may do anything. The module of such a function is imported before that is known; Python's own never are.
 
     Raises:
-        DelayRLError: it may not name this, or `find_object` does not find it.
+        DelayRLError: it may not name this, or `find_maker` does not find it.
     """
     refusal = DelayRLError(f"{folder} came with a task that could run any code, {name}: if you mean it, give it as env")
     if is_unsafe(name, folder):
         raise refusal
-    found = find_object(name)
+    found = find_maker(name)
     if isinstance(found, str) or (isinstance(found, type) and issubclass(found, gym.Env)) or _is_own(found):
         return found
     raise refusal

@@ -10,7 +10,7 @@ from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper
-from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task
+from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task, closing
 from delayrl.errors import DelayRLError, near_names
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.layers import check_length
@@ -86,9 +86,8 @@ def delay_of(env: TaskLike, delay: DelayLike) -> Delay:
     """Convert a delay to steps of a task, which is made only if its step length is needed. Raises DelayRLError."""
 
     def step_seconds() -> float | None:
-        made = task.make()
-        made.close()
-        return seconds_of(made)
+        with closing(task.make()) as made:
+            return seconds_of(made)
 
     task = as_task(env)
     parsed = as_delay(delay, step_seconds)

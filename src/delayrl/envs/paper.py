@@ -13,7 +13,6 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from delayrl.envs.registration import NOISE as NOISE
 from delayrl.envs.registration import TASKS as TASKS
 from delayrl.envs.registration import register as register
 from delayrl.errors import DelayRLError

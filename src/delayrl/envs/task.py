@@ -26,7 +26,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation
 
-from delayrl.envs.lookup import find_id, find_object, find_stored, refuse_instance, with_version
+from delayrl.envs.lookup import find_id, find_maker, find_stored, refuse_instance, with_version
 from delayrl.errors import DelayRLError
 from delayrl.lookup import name_of_object, one_line, parse_arguments, with_arguments
 
@@ -57,7 +57,7 @@ class Part:
             return FlattenObservation
         if self.name.startswith("<"):
             raise DelayRLError(f"{self.name} has no name that it could be imported by: give it again, as env")
-        return find_object(self.name) if ":" in self.name else find_id(self.name)
+        return find_maker(self.name) if ":" in self.name else find_id(self.name)
 
     def __str__(self) -> str:
         return with_arguments(self.name, self.kwargs)
@@ -227,3 +227,13 @@ def quiet() -> Iterator[None]:
             mujoco.set_mju_user_warning(lambda message: None)
             stack.callback(mujoco.set_mju_user_warning, None)
         yield
+
+
+@contextlib.contextmanager
+def closing(env: Any) -> Iterator[Any]:
+    """Yield an environment, and close it at the end. What its `close` raises changes no result, and is left aside."""
+    try:
+        yield env
+    finally:
+        with contextlib.suppress(Exception):
+            env.close()

@@ -12,6 +12,7 @@ that `step(a)` returns reacts to that a.
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from operator import itemgetter
 from typing import Any
@@ -93,7 +94,8 @@ def probe(
         raise DelayRLError(f"{task} failed while it was played: {described(error)}") from error
     finally:
         if task is not env:
-            task.close()
+            with suppress(Exception):  # it changes no result
+                task.close()
 
 
 def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Iterable[int]], Iterable[int]]) -> Probed:
@@ -105,7 +107,7 @@ def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Ite
     while steps < delay + SPARE:
         steps = delay + SPARE
         pushes = [push(env, seed + e, scale, steps) for e in wrap(range(episodes))]
-        ages = [_total(p) for p in pushes]
+        ages = [_shown(p.obs, np.arange(len(p.obs)) + 1) for p in pushes]  # as if each action acted at once
         delay = min(max(delay, *(int(age.max()) for age in ages)), longest)  # random delays may exceed the first
     oldest = max((int(age.max()) for age in ages if (age >= 0).any()), default=delay)
     total = _count_ages(ages, oldest)
@@ -188,11 +190,6 @@ def _action_channel(pushes: list[Pushes]) -> tuple[str, str]:
         if label and acted and all(acted):
             return label, channel
     return "nothing: no state is visible and rewards do not react before observations", ""
-
-
-def _total(pushes: Pushes) -> Array:
-    """Return the age at each step of the newest action with an effect, [T+1]; -1 if unknown."""
-    return _shown(pushes.obs, np.arange(len(pushes.obs)) + 1)  # as if each action acted at once
 
 
 def _shown(effect: Array, acted: Array) -> Array:

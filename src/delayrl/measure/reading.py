@@ -230,7 +230,7 @@ def _check_times(path: Path, name: str, seconds: Array, episodes: Array) -> None
 
 def _number(cell: Any) -> bool:
     try:
-        return cell is not None and not math.isnan(float(cell) * 0 + 1)
+        return cell is not None and math.isfinite(float(cell))
     except (TypeError, ValueError):
         return False
 

@@ -18,7 +18,7 @@ from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
 from delayrl.envs.making import check_limit, delay_of, make, name_of
-from delayrl.envs.task import Task, TaskLike, as_task
+from delayrl.envs.task import Task, TaskLike, as_task, closing
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.play.policy import Policy, load, spec_of, task_of, trained_delay
@@ -56,7 +56,7 @@ class Evaluator:
         self._act = _compiled_act(agent)
         with contextlib.ExitStack() as held:
             self._envs = [
-                [held.enter_context(stepping.closing(make(env, served, rescale=True))) for _ in range(episodes)]
+                [held.enter_context(closing(make(env, served, rescale=True))) for _ in range(episodes)]
                 for _ in range(seeds)
             ]
             check_fits(self._envs[0][0], spec)

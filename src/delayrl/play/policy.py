@@ -14,9 +14,8 @@ from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, stored_delay
 from delayrl.envs.making import make
-from delayrl.envs.task import Task, TaskLike, stored_task
+from delayrl.envs.task import Task, TaskLike, closing, stored_task
 from delayrl.errors import DelayRLError
-from delayrl.play import stepping
 from delayrl.run.agents import AgentLike, agent_of
 from delayrl.run.arrays import inner_range, restore_tree
 from delayrl.run.checkpoint import Checkpoint
@@ -133,7 +132,7 @@ def restored(
 ) -> Policy:
     """Load the policy in a checkpoint of a run with this configuration, whose task is looked up; `given` as `load`."""
     agent = agent_of(config, run.path, given)
-    with stepping.closing(make(task, trained_delay(run.path))) as env:
+    with closing(make(task, stored_delay(config["delay"], run.path))) as env:
         spec, actions = spec_of(env), env.action_space
     try:
         state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
-from delayrl.run.folder import RunFolder, RunLike, is_config, path_of, seed_folders
+from delayrl.run.folder import RunFolder, RunLike, is_config, path_of
 from delayrl.run.rows import whole_evaluations
 
 if TYPE_CHECKING:  # they take JAX, and listing runs does not
@@ -107,8 +107,3 @@ def runs(folder: str | Path = "runs") -> list[Run]:
     if not Path(folder).is_dir():
         raise DelayRLError(f"there is no folder {folder}")
     return [Run(file.parent) for file in sorted(Path(folder).rglob("config.json")) if is_config(file)]
-
-
-def seed_runs(path: RunLike) -> list[Run]:
-    """Return the run in a folder, or those of several seeds below it, by their seeds."""
-    return [Run(folder.path) for folder in seed_folders(path)]

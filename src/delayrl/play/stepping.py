@@ -1,8 +1,6 @@
 """Reset and step environments whose code is the user's: what it raises becomes one line that says where."""
 
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -38,16 +36,6 @@ def step(env: Any, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]
     except (TypeError, ValueError):
         given = f"the reward {reward!r}, terminated = {terminated!r} and truncated = {truncated!r}"
         raise DelayRLError(f"{name_of(env)} gave {given}: they must be a number and two truth values") from None
-
-
-@contextmanager
-def closing(env: Any) -> Iterator[Any]:
-    """Yield an environment, and close it at the end. What its `close` raises changes no result, and is left aside."""
-    try:
-        yield env
-    finally:
-        with suppress(Exception):
-            env.close()
 
 
 def _check_shape(env: Any, truth: Any) -> None:

@@ -19,7 +19,7 @@ GREY = '<span style="color:#888">{}</span>'
 
 def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequence[Mapping[str, Any]] = ()) -> str:
     """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
-    legend = "† reads the true state while it trains. ± is the standard deviation over seeds."
+    legend = "† acts on the true state while it trains. ± is the standard deviation over seeds."
     parts = [f"# {_escape(title)}", f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip()]
     parts += [_escape(line) for line in wording.remarks(summary, versions)]
     for setting in summary.settings:

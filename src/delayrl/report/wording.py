@@ -210,8 +210,9 @@ def _range(values: Sequence[float]) -> str:
 
 def _short(value: float) -> str:
     """Write a large number with three digits and k, M, G or T."""
+    value = float(f"{value:.3g}")
     power = min(4, int(math.log10(value)) // 3) if value >= 1 else 0
-    return f"{float(f'{value / 1000**power:.3g}'):g}{('', 'k', 'M', 'G', 'T')[power]}"
+    return f"{value / 1000**power:g}{('', 'k', 'M', 'G', 'T')[power]}"
 
 
 def source(table: Table) -> str:
@@ -246,7 +247,8 @@ def overrides(summary: Summary) -> list[str]:
 
 def remarks(summary: Summary, versions: Sequence[Mapping[str, Any]]) -> list[str]:
     """Write what must be known of all results: rows left out, tasks that changed, overrides, machines and libraries."""
-    left_out = [f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out."] * bool(summary.unplaced)
+    line = f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out."
+    left_out = [line] if summary.unplaced else []
     changed = [
         f"The simulated model of {env} is not the same in all rows, under one version of MuJoCo: returns of different "
         "tasks stand together."

@@ -132,7 +132,8 @@ def known_agents() -> dict[str, Registration]:
 def _checked(thing: Any, name: str) -> Agent:
     """Return an agent: the given one, or one of the given class. Raises DelayRLError if it is none, or not usable."""
     page = "docs/own-agent.md shows one"
-    lacks = [part for part in PARTS if not hasattr(thing, part) and part not in _field_names(thing)]
+    names = {field.name for field in fields(thing)} if is_dataclass(thing) else set()
+    lacks = [part for part in PARTS if not hasattr(thing, part) and part not in names]
     if not is_dataclass(thing) or lacks:
         what = f"it lacks {', '.join(lacks)}" if is_dataclass(thing) else "it is no dataclass"
         raise DelayRLError(f"{name} is no agent, because {what}: {page}")
@@ -149,10 +150,6 @@ def _checked(thing: Any, name: str) -> Agent:
             raise DelayRLError(f"agent {name} has an option {option.name}, as every run has: give it another name")
         option.check(option.default)
     return agent  # type: ignore[no-any-return]
-
-
-def _field_names(thing: Any) -> set[str]:
-    return {field.name for field in fields(thing)} if is_dataclass(thing) else set()
 
 
 def _is_made_of(name: str, agent: Agent) -> bool:

@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple, Self
 
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
-from delayrl.run.rows import CONDITION
 
 CellState = Literal["todo", "running", "done", "failed"]
 
@@ -29,8 +28,7 @@ class Cell:
     @property
     def json(self) -> dict[str, Any]:
         """What cell.json and the table of results store of it, without its id."""
-        values = self.condition.json | {"seeds": list(self.seeds)}
-        return {name: values[name] for name in (*CONDITION, "seeds", "overrides", "steps")}
+        return self.condition.json | {"seeds": list(self.seeds)}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], id: str) -> Self:

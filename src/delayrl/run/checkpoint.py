@@ -8,12 +8,9 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from delayrl.errors import DelayRLError
-
-if TYPE_CHECKING:
-    from delayrl.run.arrays import Arrays
+from delayrl.run.arrays import Arrays, load_arrays
 
 
 @dataclass(frozen=True)
@@ -31,10 +28,8 @@ class Checkpoint:
         """Whether it holds what training further takes, besides the networks."""
         return "loop.safetensors" in self.files
 
-    def arrays(self, name: str) -> "Arrays":
+    def arrays(self, name: str) -> Arrays:
         """Read one of its files: "agent" or "loop"."""
-        from delayrl.run.arrays import load_arrays  # NumPy only where arrays are read: `bench status` starts faster
-
         return load_arrays(self.path / f"{name}.safetensors")
 
     def check(self, *, replay: bool) -> None:

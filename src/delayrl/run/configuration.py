@@ -56,7 +56,7 @@ class Option:
             if self.name.endswith("_range") and numbers[0] >= numbers[-1]:
                 raise DelayRLError(f"{self.name} is LOW HIGH, with LOW below HIGH; got {', '.join(map(str, value))}")
             return numbers
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e308:
             raise DelayRLError(f"{self.name} must be a number; got {value!r}")
         if not self.bounds[0] <= value <= self.bounds[1]:
             low, high = self.bounds

@@ -11,6 +11,7 @@ from delayrl.agents.base import State, template
 from delayrl.core import replay as ring
 from delayrl.core.types import Spec
 from delayrl.envs.making import make
+from delayrl.envs.task import closing
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.play.policy import spec_of
@@ -77,7 +78,7 @@ def check_fit(setup: Setup, env: Delayed) -> State:
 
 def check_repeats(setup: Setup) -> None:
     """Warn if an environment does not begin twice in the same way from one seed. It is made for that, and closed."""
-    with stepping.closing(make(setup.task, setup.delay.observed(), rescale=True)) as env:
+    with closing(make(setup.task, setup.delay.observed(), rescale=True)) as env:
         first, again = (stepping.reset(env, 0)[1]["truth"] for _ in range(2))
     if not np.array_equal(first, again):
         why = "its reset has to call super().reset(seed=seed), and its wrappers to keep nothing over a reset"

@@ -84,10 +84,8 @@ def go_on(
 def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Delay, steps: int) -> Setup:
     """Return the setup of a run with this configuration that is to have `steps` steps."""
     stored = {**config["hyperparameters"], **config["schedule"]}
-    known: dict[str, Any] = {}
-    if config["agent"] in AGENTS:
-        preset = AGENTS[config["agent"]].presets[config["preset"]]
-        known = {**values_of(preset.agent), **values_of(preset.schedule)}
+    presets = AGENTS[config["agent"]].presets if config["agent"] in AGENTS else {}
+    known = {name for part in presets.get(config["preset"], ()) for name in values_of(part)}
     older = {name: value for name, value in OLDER.items() if name in known}
     setup = resolve(agent, task, delay, config["preset"], config["protocol"], {**older, **stored, "steps": steps})
     origin = dict(config.get("origin", {}))

@@ -135,8 +135,8 @@ class Loop:
         """Return the actions, but those of the protocol in episodes that open."""
         opening = self.group.setup.protocol.opening
         length = opening_length(opening, self.group.spec.delay)
-        opens = [[len(actor.actions) < length] for actor in self.state.actors]
-        if [True] not in opens:  # does not wait for the actions
+        opens = np.array([[len(actor.actions) < length] for actor in self.state.actors])
+        if not opens.any():  # does not wait for the actions
             return actions
         return np.where(opens, np.float32(0) if opening == "zeros" else self._random_actions(), actions)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 def cores() -> int:
     """Return how many cores this process may keep busy: those that it may run on, or a container's share of them."""
     number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota, _, period = limit("cpu.max").partition(" ")
+    quota, _, period = control_group("cpu.max").partition(" ")
     return max(1, min(number, int(quota) // int(period))) if quota.isdigit() and period.isdigit() else number
 
 
@@ -18,14 +18,15 @@ def free_memory() -> int:
     about = Path("/proc/meminfo")
     found = re.search(r"^MemAvailable:\s+(\d+) kB", about.read_text(), re.MULTILINE) if about.exists() else None
     free = int(found[1]) * 1024 if found else 2**62
-    most, used = limit("memory.max"), limit("memory.current")
+    most, used = control_group("memory.max"), control_group("memory.current")
     if not (most.isdigit() and used.isdigit()):
         return free
-    cached = re.search(r"^inactive_file (\d+)$", limit("memory.stat"), re.MULTILINE)  # given back when memory is short
+    # given back when memory is short
+    cached = re.search(r"^inactive_file (\d+)$", control_group("memory.stat"), re.MULTILINE)
     return min(free, int(most) - int(used) + (int(cached[1]) if cached else 0))
 
 
-def limit(name: str) -> str:
+def control_group(name: str) -> str:
     """Return what a file of the control group of a container says; nothing where there is none."""
     try:
         return Path("/sys/fs/cgroup", name).read_text().strip()

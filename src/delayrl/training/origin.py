@@ -70,7 +70,7 @@ def _renamed(stored: Arrays, old: str, new: str) -> Arrays:
     """Return the arrays whose names begin with `old`, under names that begin with `new` instead."""
     renamed: Arrays = {}
     for name, array in stored.items():
-        outer = "agent." * name.startswith("agent.")  # where normalisation keeps the agent
+        outer = "agent." if name.startswith("agent.") else ""  # where normalisation keeps the agent
         if name.startswith(outer + old):
             renamed[outer + new + name.removeprefix(outer + old)] = array
     return renamed

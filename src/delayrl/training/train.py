@@ -16,8 +16,7 @@ from delayrl.core.cache import keep_compiled
 from delayrl.core.precision import setting
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
-from delayrl.envs.task import TaskLike, WrapperLike, as_task
-from delayrl.play import stepping
+from delayrl.envs.task import TaskLike, WrapperLike, as_task, closing
 from delayrl.play.policy import spec_of
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
@@ -82,7 +81,7 @@ def train(
         out: the run folder of one seed, of a list of one too; of several seeds the folder of their run folders.
         device: "cpu" or "gpu"; None leaves the choice to JAX.
         overwrite: start afresh where a run exists.
-        protocol: "corrected", or "official": the released code's habits (docs/concepts.md).
+        protocol: "corrected", or "official": the released code's habits (docs/protocols.md).
         track: "tensorboard" or "wandb" as well (extras of the same names).
         threads: threads that step the environments, of training and of evaluation. The results do not depend on it.
         slim: keep of a finished run only its last networks, and not what `go_on` takes (the replay).
@@ -127,7 +126,7 @@ def train_group(
     check_ways(ways)
     with ExitStack() as held:
         made = (make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers)
-        envs = [held.enter_context(stepping.closing(env)) for env in made]
+        envs = [held.enter_context(closing(env)) for env in made]
         spec = spec_of(envs[0])
         shapes = check_fit(setup, envs[0])  # before anything is stored
         check_memory(setup, spec, len(numbers), ways.device)
@@ -151,9 +150,9 @@ def train_group(
             if ways.progress:
                 tqdm.write(line, file=sys.stderr)
 
-        if given is not None and not setup.delay.maximum:
+        if given is not None and not setup.delay.latest:
             note("delay: none")
-        elif given is not None and (seconds := seconds_of(envs[0])):
+        elif given is not None and setup.delay.maximum and (seconds := seconds_of(envs[0])):
             note(f"delay: {in_other_unit(given, setup.delay, seconds)}")
         state = start(group, actors, overwrite, note)
         if state.step == 0:
