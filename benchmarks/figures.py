@@ -281,8 +281,8 @@ def younger_table(lines: list[dict[str, Any]]) -> str:
     seeds = len({row["seed"] for row in rows})
     about = (
         f"{policy['env']}; `{policy['agent']}` trained with delay {policy['delay']}, preset `{policy['preset']}`, "
-        f"{policy['schedule']['steps']:,} steps, {seeds} seeds, {len(rows[0]['returns'])} episodes each; ± is the standard "
-        f"deviation over seeds. MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: "
+        f"{policy['schedule']['steps']:,} steps, {seeds} seeds, {len(rows[0]['returns'])} episodes each; ± is the "
+        f"standard deviation over seeds. MuJoCo {versions['mujoco']}, commit {versions['commit']}. Rows: "
         "`benchmarks/results/younger.jsonl`."
     )
     return f"{markdown_table(['travel time, steps', 'held back', 'shown at once (`min_age=0`)'], body)}\n\n{about}"
