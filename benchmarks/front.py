@@ -56,8 +56,10 @@ def section(files: list[Path], pictures: Path) -> str:
         "number is given. In brackets is the 95 % interval of the mean, below it the return at the end, ± the standard "
     )
     made += "deviation over seeds, each of ten episodes. † acts on the true state while it trains. VDPO has "
-    made += "`--tokens 1280`. Any-age's critics have layer normalisation, and with `critic_norm=layer` those of SAC and BPQL; those of "
-    made += "VDPO, lifting and A-SAC have none. "
+    made += (
+        "`--tokens 1280`. Any-age's critics have layer normalisation, and with `critic_norm=layer` those of SAC and "
+    )
+    made += "BPQL; those of VDPO, lifting and A-SAC have none. "
     made += f"{made_on(used)} {rows_of(files, tables)}"
     return f"{table(chosen)}\n\n{made}"
 
