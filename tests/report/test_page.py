@@ -1,5 +1,6 @@
 """The page: its data, what must never break out of it, and the page in a real browser."""
 
+import functools
 import json
 import math
 import os
@@ -10,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic import EVIL, NASTY, Standing, anchored, full_grid, nasty, rows, small
+from synthetic import EVIL, NASTY, anchored, full_grid, nasty, rows, small
 
 from delayrl.report.page import page, payload
 from delayrl.report.report import report
-from delayrl.report.summary import summarise
+from delayrl.report.summary import Summary, summarise
 from delayrl.run.cell import Progress
 
 
@@ -79,9 +80,9 @@ def opened(browser: Any, tmp_path: Path) -> Iterator[Any]:
     errors: list[str] = []
     pages = []
 
-    def open_page(cells: list[Standing], every: list[dict[str, Any]], title: str = "Synthetic", **options: Any) -> Any:
+    def open_page(summary: Summary, title: str = "Synthetic", **options: Any) -> Any:
         out = tmp_path / "report.html"
-        out.write_text(page(summarise(every, cells), title))
+        out.write_text(page(summary, title))
         view = browser.new_page(**options)
         pages.append(view)
         view.on("console", lambda message: errors.append(message.text))
@@ -100,15 +101,16 @@ def opened(browser: Any, tmp_path: Path) -> Iterator[Any]:
     assert not errors
 
 
-def sampled() -> tuple[list[Standing], list[dict[str, Any]]]:
-    """A part of the grid: two tasks, one cell running, one failed, one not begun."""
+@functools.cache
+def sampled() -> Summary:
+    """Of a part of the grid: two tasks, one cell running, one failed, one not begun."""
     progress = {
         "vdpo-delayrl/Ant-v4-25-": Progress("running", 400_000),
         "bpql-delayrl/Ant-v4-50-": Progress("failed", 200_000),
         "a-sac-delayrl/Hopper-v4-5-": Progress("todo", 0),
     }
     cells = [(cell, progress.get(cell.id, ended)) for cell, ended in full_grid(3, ["Ant", "Hopper"])]
-    return cells, list(rows(cells, evaluations=10, episodes=1))
+    return summarise(list(rows(cells, evaluations=10, episodes=1)), cells)
 
 
 def column(view: Any, table: str, index: int) -> list[str]:
@@ -117,7 +119,7 @@ def column(view: Any, table: str, index: int) -> list[str]:
 
 @pytest.mark.thorough
 def test_page_sorts(opened: Any) -> None:
-    view = opened(*sampled())
+    view = opened(sampled())
     heads = view.locator("#all thead th").all_inner_texts()
     returns = heads.index("Return")
     button = view.locator("#all thead button").nth(returns)
@@ -138,7 +140,8 @@ def test_page_sorts(opened: Any) -> None:
 
 def test_page_shows_all_digits_of_steps(opened: Any) -> None:
     cells = small()
-    view = opened([*cells.values()], anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]]))
+    every = anchored(cells, vdpo=[[0.0, 120, 60], [10.0, 110, 160]])
+    view = opened(summarise(every, [*cells.values()]))
     heads = view.locator("#all thead th").all_inner_texts()
     assert sorted(column(view, "all", heads.index("Steps to Ret_df"))) == ["", "", "200\n200 to 200"]
 
@@ -146,14 +149,15 @@ def test_page_shows_all_digits_of_steps(opened: Any) -> None:
 def test_page_rounds_once(opened: Any) -> None:
     """A return of 3,406.46 is the same in every table."""
     cells = small()
-    view = opened([*cells.values()], anchored(cells, vdpo=[[0.0, 0, 3406.46], [0.0, 0, 3406.46]]))
+    every = anchored(cells, vdpo=[[0.0, 0, 3406.46], [0.0, 0, 3406.46]])
+    view = opened(summarise(every, [*cells.values()]))
     assert "raw 3,406 ± 0" in view.locator("#normalised-0").inner_text()
     assert "3,406 ± 0" in view.locator("#all").inner_text()
 
 
 @pytest.mark.thorough
 def test_page_filters(opened: Any) -> None:
-    view = opened(*sampled())
+    view = opened(sampled())
     assert set(column(view, "all", 0)) == {"delayrl/Ant-v4", "delayrl/Hopper-v4"}
     panels = view.locator("#curves figure").count()
     view.locator("#filter-task button", has_text="Hopper").click()
@@ -171,8 +175,7 @@ def test_page_filters(opened: Any) -> None:
 
 @pytest.mark.thorough
 def test_page_compares_each_two_agents(opened: Any) -> None:
-    cells, every = sampled()
-    view, shown = opened(cells, every), payload(summarise(every, cells), "")
+    view, shown = opened(sampled()), payload(sampled(), "")
     lines = {(c["delay"], c["one"]) for c in shown["comparisons"]}
     assert view.locator("#comparison tbody tr").count() == len(lines)
     assert view.locator("#comparison tbody td b").count() == sum(c["clear"] for c in shown["comparisons"])
@@ -181,7 +184,7 @@ def test_page_compares_each_two_agents(opened: Any) -> None:
 
 
 def test_page_draws_curves_and_shows_values(opened: Any) -> None:
-    view = opened(*sampled())
+    view = opened(sampled())
     assert view.locator("#curves figure").count() == 8  # 2 tasks × 4 delays
     assert view.locator("#curves figure").first.locator("polyline.curve").count() == 8
     assert view.locator("#delay figure").count() == 2
@@ -201,7 +204,7 @@ def test_page_draws_curves_and_shows_values(opened: Any) -> None:
 
 @pytest.mark.thorough
 def test_page_marks_what_goes_on(opened: Any) -> None:
-    view = opened(*sampled())
+    view = opened(sampled())
     states = column(view, "all", 12)
     assert "at 400,000 of 1,000,000 steps" in states
     assert "failed at 200,000 of 1,000,000 steps" in states
@@ -215,7 +218,7 @@ def test_page_marks_what_goes_on(opened: Any) -> None:
 def test_page_in_light_and_dark(opened: Any, tmp_path: Path) -> None:
     grounds = []
     for scheme in ("light", "dark"):
-        view = opened(*sampled(), color_scheme=scheme)
+        view = opened(sampled(), color_scheme=scheme)
         grounds.append(view.evaluate("getComputedStyle(document.body).backgroundColor"))
         assert view.evaluate("document.documentElement.dataset.theme") == scheme
     view.locator("#theme").click()
@@ -224,13 +227,13 @@ def test_page_in_light_and_dark(opened: Any, tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_page_on_a_phone(opened: Any) -> None:
-    view = opened(*sampled(), viewport={"width": 390, "height": 800})
+    view = opened(sampled(), viewport={"width": 390, "height": 800})
     assert view.evaluate("document.documentElement.scrollWidth") <= 390  # tables scroll, the page does not
 
 
 def test_names_run_no_script(opened: Any) -> None:
     cells, every = nasty()
-    view = opened(cells, every, EVIL)
+    view = opened(summarise(every, cells), EVIL)
     assert view.locator("h1").inner_text() == EVIL
     assert EVIL in column(view, "all", 2)
     assert view.locator("script").count() == 2
