@@ -45,6 +45,7 @@ class Program:
     def __init__(self, agent: Agent, spec: Spec, learnable: ring.Learnable = ring.ALL) -> None:
         self.phases, self._agent, self._spec = agent.phases(), agent, spec
         self.learnable = learnable
+        self._init = jax.jit(jax.vmap(functools.partial(agent.init, spec)))
         self._append = functools.partial(ring.append, learnable=learnable)
         self._jitted_act = jax.jit(self._act)
         self._jitted_learn = jax.jit(self._learn, static_argnames="first_phase", donate_argnums=0)
@@ -56,9 +57,8 @@ class Program:
 
     def init(self, keys: Key, capacity: int) -> Learner:
         """Make fresh agents and empty replays."""
-        states = jax.jit(jax.vmap(functools.partial(self._agent.init, self._spec)))(keys)
         shapes = jax.eval_shape(lambda: ring.init(self._spec, capacity))
-        return Learner(states, jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), shapes))
+        return Learner(self._init(keys), jax.tree.map(lambda x: jnp.zeros((len(keys), *x.shape), x.dtype), shapes))
 
     def act(self, agent: State, seen: Seen, keys: Key, step: int) -> Action:
         """Choose exploring actions for all seeds. Returns without waiting for them."""
