@@ -11,7 +11,7 @@ check:     ## format, lint, types
 test:      ## at least one test of everything, in minutes
 	pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test-all:  ## all tests but those that train for minutes (pytest -m slow)
+test-all:  ## all tests but the slow ones (pytest -m slow)
 	pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow'
 
 coverage:  ## test-all, and which lines it does not run

@@ -71,9 +71,10 @@ TINY = {
 }
 
 
-def quick(names: Iterable[str], *kept: str) -> list:
-    """Return parameters of a test: those that `make test` keeps, and all others marked `thorough`."""
-    return [name if name in kept else pytest.param(name, marks=pytest.mark.thorough) for name in names]
+def quick(names: Iterable[str], *kept: str, slow: Iterable[str] = ()) -> list:
+    """Return parameters of a test: those that `make test` keeps, and all others marked `slow` or `thorough`."""
+    marks = {name: pytest.mark.slow if name in slow else pytest.mark.thorough for name in names}
+    return [pytest.param(name, marks=() if name in kept else mark) for name, mark in marks.items()]
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -83,16 +84,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the folders that take longest, so that both processes end at about the same time."""
+    """Begin with the folders that take longest, so that both processes end at about the same time.
+
+    What holds for every agent is tested agent by agent: its programs are dropped only after all that need them.
+    """
     items.sort(key=lambda item: item.path.parent.name not in ("agents", "training"))
+    shared = [item for item in items if item.path.name == "test_agents.py"]
+    by_agent = iter(sorted(shared, key=lambda item: item.callspec.params.get("name", "") if "[" in item.name else ""))
+    items[:] = [next(by_agent) if item.path.name == "test_agents.py" else item for item in items]
 
 
 @pytest.fixture(autouse=True)
 def little_memory() -> Iterator[None]:
-    """Drop compiled programs before they take a gigabyte, or so many of the 65,530 memory maps that XLA crashes."""
+    """Drop compiled programs before they take two gigabytes, or so many of the 65,530 memory maps that XLA crashes."""
     yield
     status, maps = Path("/proc/self/status"), Path("/proc/self/maps")
-    if status.exists() and (resident(status) > 2**30 or maps.read_bytes().count(b"\n") > 20_000):
+    if status.exists() and (resident(status) > 2**31 or maps.read_bytes().count(b"\n") > 45_000):
         jax.clear_caches()
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)  # compiling leaves hundreds of megabytes that are free, but not given back
