@@ -92,11 +92,10 @@ def test_a_block_of_steps_is_its_steps(name: str) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("seeds", [pytest.param(1, marks=pytest.mark.thorough), 2])
-@pytest.mark.parametrize("block", [1, pytest.param(4, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(("seeds", "block"), [(1, 1), pytest.param(2, 4, marks=pytest.mark.thorough)])
 def test_learning_copies_no_replay(seeds: int, block: int) -> None:
-    """What the compiled programs need beside their arguments does not grow with the replay, which stays in place."""
-    program = program_of(TINY["bpql"], 3)
+    """What the compiled programs need beside their arguments is less than the smallest column of the replay."""
+    program, capacity = program_of(TINY["bpql"], 3), 10**6
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     step = jax.tree.map(lambda x: np.stack([[x] * seeds] * block), record(ENV, 3, 1)[0][0])
     stored, steps = Stored(step, np.zeros((block, seeds), np.int32)), np.full(block, 100)
@@ -109,12 +108,10 @@ def test_learning_copies_no_replay(seeds: int, block: int) -> None:
         moment = np.zeros(seeds, np.int32)
         return [program._jitted_append.lower(learner.replay, first.transition, moment), update]
 
-    needed = []
-    for capacity in (200, 100_000):
-        learner = jax.eval_shape(lambda capacity=capacity: program.init(keys, capacity))
-        compiled = [lowered.compile({"xla_backend_optimization_level": 3}) for lowered in programs(learner)]
-        needed.append([one.memory_analysis().temp_size_in_bytes for one in compiled])
-    assert needed[0] == needed[1]
+    learner = jax.eval_shape(lambda: program.init(keys, capacity))
+    for lowered in programs(learner):
+        compiled = lowered.compile({"xla_backend_optimization_level": 3})
+        assert compiled.memory_analysis().temp_size_in_bytes < capacity  # a column has a byte a row, or more
 
 
 @pytest.mark.parametrize("block", [1, 3])
