@@ -29,7 +29,7 @@ def mean_return(path: Path, **options) -> float:
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_memory_pays(tmp_path: Path) -> None:
     """s' = s + a, reward -s², Δ = 4: x_t is enough to stand still; the last observation alone is not (three seeds)."""
     options = QUICK | {"env": "delayrl/Walk-v0", "delay": 4, "steps": 3000, "seeds": 3}
@@ -39,7 +39,10 @@ def test_memory_pays(tmp_path: Path) -> None:
     assert memoryless < 2 * augmented - 10
 
 
-@pytest.mark.parametrize("agent", quick([name for name in AGENTS if name not in ("random", "sac")], "bpql"))
+ALIKE = ("sac-memoryless", "a-sac", "any-age", "lifting", "ad-sac", "dcac")  # they learn from one phase, as bpql does
+
+
+@pytest.mark.parametrize("agent", quick([name for name in AGENTS if name not in ("random", "sac")], "bpql", slow=ALIKE))
 def test_nobody_guesses_a_coin(agent: str, tmp_path: Path) -> None:
     """The state is a fresh coin, the reward a·s: the mean of 1,000 steps stays within 4 standard errors of 0."""
     own = {
