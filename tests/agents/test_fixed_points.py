@@ -240,6 +240,7 @@ def test_the_auxiliary_actor_is_soft_greedy_for_the_shared_critics() -> None:
     assert_gaussians(agent.policy(state.actor, jnp.eye(STATES)), mean, np.exp(log_std))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(AGENTS))
 def test_critics_take_one_step_from_the_target_critics(name: str) -> None:
     """Targets that say 7 and 9 everywhere and never move: Q = r + γ V, V the least of what the agent compares."""
@@ -265,7 +266,12 @@ def test_critics_take_one_step_from_the_target_critics(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("encoder", "weight", "distance"),
-    [("mlp", 0.0, "moments"), ("mlp", 1.0, "moments"), ("mlp", 1.0, "kl"), ("forecast", 0.0, "moments")],
+    [
+        pytest.param("mlp", 0.0, "moments", marks=pytest.mark.slow),
+        ("mlp", 1.0, "moments"),
+        pytest.param("mlp", 1.0, "kl", marks=pytest.mark.slow),
+        ("forecast", 0.0, "moments"),
+    ],
 )
 def test_any_age_ends_where_its_pull_leaves_it(encoder: Any, weight: float, distance: Any) -> None:
     """Without a pull at BPQL's policy. Gaussians cannot be the geometric mean, so that KL moves them too, but less.
