@@ -15,7 +15,6 @@ from killing import KilledError, moments, options
 import delayrl
 from conftest import quick
 from delayrl.agents.registry import AGENTS
-from delayrl.core.precision import FEW
 from delayrl.play.run import Run
 from delayrl.run.folder import RunFolder
 from delayrl.training.actor import Actor
@@ -67,7 +66,7 @@ def die(agent: str, out: Path, now: Callable[[int, str, str], bool]) -> bool:
 
 
 @pytest.mark.parametrize("trial", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 8))])
-@pytest.mark.parametrize("agent", quick(KILLED, "sac"))
+@pytest.mark.parametrize("agent", quick(KILLED, "sac", slow=["vdpo"]))
 def test_killed_at_random_moments(agent: str, trial: int, tmp_path: Path, whole) -> None:
     """Several times in a row, half of them while something is written or deleted."""
     runs, found = whole(agent)
@@ -116,15 +115,15 @@ def test_sigkill_at_random_moments(agent: str, trial: int, tmp_path: Path, whole
     sigkilled(agent, int(moment), tmp_path / "cut", runs)
 
 
-KEPT = ("any-age", "vdpo")  # the others are thorough
+KEPT = ("any-age", "vdpo")
+ALIKE = ("sac", "sac-memoryless", "a-sac", "lifting", "ad-sac", "dcac")  # their states are like bpql's
 
 
 @pytest.mark.parametrize(
     ("agent", "at", "options"),
     [
         ("bpql", 260, {"protocol": "official"}),
-        ("bpql", 237, {"precision": "bfloat16", "hidden": [FEW, FEW]}),
-        *(pytest.param(agent, 237, {}, marks=() if agent in KEPT else pytest.mark.thorough) for agent in AGENTS),
+        *(pytest.param(*param.values, 237, {}, marks=param.marks) for param in quick(AGENTS, *KEPT, slow=ALIKE)),
     ],
 )
 def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict, tmp_path: Path, monkeypatch) -> None:
@@ -160,7 +159,11 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict,
 
 @pytest.mark.parametrize(
     ("agent", "block"),
-    [("bpql", 4), *(pytest.param(*of, marks=pytest.mark.thorough) for of in [("bpql", 1), ("vdpo", 10)])],
+    [
+        ("bpql", 4),
+        pytest.param("bpql", 1, marks=pytest.mark.thorough),
+        pytest.param("vdpo", 10, marks=pytest.mark.slow),
+    ],
 )
 def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_path: Path, monkeypatch) -> None:
     """A run that is asked to stop keeps its newest steps and goes on with them, bit for bit."""

@@ -48,7 +48,7 @@ def test_same_seed_same_run(vdpo: Run, tmp_path: Path) -> None:
     assert other.rows()[0]["return"] != vdpo.rows()[0]["return"]
 
 
-@pytest.mark.parametrize("agent", quick(["bpql", "vdpo"], "bpql"))
+@pytest.mark.parametrize("agent", quick(["bpql", "vdpo"], "bpql", slow=["vdpo"]))
 def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
     """Two seeds and their evaluations stepped by three threads: rows and parameters of each as ever."""
     alone = train(agent, tmp_path / "alone", seeds=2)
