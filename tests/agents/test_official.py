@@ -142,6 +142,7 @@ def test_openings(agent: str, kind: str, length: int, tmp_path: Path, monkeypatc
         start(self, episode)
 
     monkeypatch.setattr(type(AGENTS[agent].presets["small"].agent), "act", act)
+    monkeypatch.setattr(type(AGENTS[agent].presets["small"].agent), "phases", lambda self: ())  # nothing is learned
     monkeypatch.setattr(delayrl.Delayed, "step", spy)
     monkeypatch.setattr(Actor, "start_episode", note)
     values = {"random_steps": 50, "steps": 210, "replay_capacity": 1000}
@@ -208,7 +209,7 @@ def test_what_is_learned_from() -> None:
         assert drawn - unfinished == expected - unfinished
 
 
-def test_capacity_counts_entries(tmp_path: Path) -> None:
+def test_capacity_counts_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """VDPO's code holds 1,000,000 entries, three for each step."""
     spec = Spec(OBS, ACT, DELAY)
     assert [1_000_000 // official(agent).entries(spec) for agent in ("vdpo", "a-sac", "bpql")] == [
@@ -216,8 +217,11 @@ def test_capacity_counts_entries(tmp_path: Path) -> None:
         333_333,
         1_000_000,
     ]
+    monkeypatch.setattr(type(TINY["a-sac"]), "phases", lambda self: ())  # of what is stored nothing is learned
+    values = {"steps": 160, "evaluate_every": 160, "replay_capacity": 90}
+    values |= {"hidden": [6, 6]}  # of an agent that no other test compiles
     for protocol, rows in (("official", 30), ("corrected", 90)):
-        run = train("a-sac", tmp_path / protocol, protocol=protocol, steps=160, evaluate_every=160, replay_capacity=90)
+        run = train("a-sac", tmp_path / protocol, protocol=protocol, **values)
         pieces = [path.stem.split("-") for path in (run.path / "replay").iterdir()]
         assert max(int(end) for _, end in pieces) - min(int(first) for first, _ in pieces) == rows - 1, protocol
 
