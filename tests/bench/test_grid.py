@@ -1,5 +1,6 @@
 """Grids: which cells a TOML file stands for, and which files are refused."""
 
+import functools
 import itertools
 import json
 from dataclasses import replace
@@ -156,10 +157,13 @@ def test_included_grids(tmp_path: Path) -> None:
 extra = 'tasks = ["Reacher-v5"]\ndelays = [0]\npreset = "small"\n'
 
 
+loaded = functools.cache(load_grid)  # of those that are shipped
+
+
 @pytest.mark.parametrize("name", shipped())
 @pytest.mark.filterwarnings("ignore::delayrl.errors.DelayWarning")
 def test_shipped_grids(name: str) -> None:
-    grid = load_grid(name)
+    grid = loaded(name)
     assert grid.is_shipped
     assert grid.name == name
     assert grid.description
@@ -170,7 +174,7 @@ def test_shipped_grids(name: str) -> None:
 @pytest.mark.filterwarnings("ignore::delayrl.errors.DelayWarning")
 def test_grids_of_the_paper() -> None:
     """The cells of its tables, with ten seeds and its preset; tables share runs."""
-    table = load_grid("paper-table2")
+    table = loaded("paper-table2")
     conditions = [cell.condition for cell in table.cells]
     delayed = {(c.env, c.delay, c.agent) for c in conditions if c.delay}
     agents = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
@@ -185,10 +189,10 @@ def test_grids_of_the_paper() -> None:
         if condition.agent != "random":
             setup = setup_of(condition)
             assert (setup.agent, setup.schedule) == tuple(AGENTS[condition.agent].presets["paper"])
-    first = load_grid("paper-table1")
+    first = loaded("paper-table1")
     assert first.ids == [cell.id for cell in table.cells if cell.condition.delay in (0, 5)]
     assert [cell.condition.agent for cell in first.cells[:5]] == ["sac", "random", "vdpo", "bpql", "ad-sac"]
-    ablation = load_grid("paper-ablation")
+    ablation = loaded("paper-ablation")
     setups = [setup_of(cell.condition) for cell in ablation.cells if cell.condition.delay]
     names = [setup.config["hyperparameters"]["representation"] for setup in setups]
     assert {name: names.count(name) for name in names} == {"transformer": 9, "transformer-no-belief": 9, "mlp": 9}
@@ -197,7 +201,7 @@ def test_grids_of_the_paper() -> None:
 
 def test_the_papers_row_has_both_anchors_under_both_protocols() -> None:
     """The random policy, and delay-free SAC for at least as many steps as every learner: what its thresholds need."""
-    conditions = [cell.condition for cell in load_grid("evidence-1-paper").cells]
+    conditions = [cell.condition for cell in loaded("evidence-1-paper").cells]
     for protocol in ("corrected", "official"):
         own = [c for c in conditions if c.protocol == protocol]
         (reference,) = {c.steps for c in own if c.agent == "sac" and c.delay == 0}

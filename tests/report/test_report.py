@@ -9,6 +9,7 @@ import pytest
 from synthetic import small
 
 from delayrl.errors import DelayRLError
+from delayrl.report.__main__ import main
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
 
@@ -37,16 +38,21 @@ def test_report_of_committed_rows(tmp_path: Path) -> None:
 
 
 def test_command(tmp_path: Path) -> None:
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "delayrl.report", *map(str, words), "--out", str(tmp_path / "out")]
-        return subprocess.run(command, capture_output=True, text=True)
-
-    assert run(RESULTS / "pendulum.jsonl").returncode == 0
+    command = [sys.executable, "-m", "delayrl.report", str(RESULTS / "pendulum.jsonl"), "--out", str(tmp_path / "out")]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+@pytest.mark.parametrize("content", ['{"step": 1', "[1]", '{"config": 5}', "\ud800"])
+def test_command_of_a_bad_file(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     bad = tmp_path / "bad.jsonl"
-    for content in ('{"step": 1', "[1]", '{"config": 5}', "\ud800"):
-        bad.write_bytes(content.encode("utf-8", "surrogatepass"))
-        done = run(bad)
-        assert done.returncode != 0
-        assert done.stderr.count("\n") == 1, done.stderr
-        assert "bad.jsonl, line 1" in done.stderr
+    bad.write_bytes(content.encode("utf-8", "surrogatepass"))
+    monkeypatch.setattr(sys, "argv", ["report", str(bad), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1, said
+    assert "bad.jsonl, line 1" in said
