@@ -1,5 +1,6 @@
 """Every agent under random delays: it learns from what its actor saw, and from nothing that had not arrived."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -9,24 +10,33 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from learners import program_of
 
 import delayrl
 from conftest import TINY, learned, record
 from delayrl.cli import main as cli
 from delayrl.core import replay as ring
 from delayrl.core.protocol import OFFICIAL
-from delayrl.core.types import Spec
+from delayrl.core.types import Seen, Spec
 from delayrl.core.views import view
 from delayrl.delays import Channel, Constant, Delay, DelayLaw, as_delay
 from delayrl.play.evaluation import evaluate
 from delayrl.training.actor import Actor
-from delayrl.training.learner import Program
 from delayrl.training.loop import hidden_steps
 from short_runs import arrays, killed_and_resumed, train
 from strategies import CHANNELS, EPISODES
 
 DELAYED = [name for name in TINY if name != "sac"]
+append = jax.jit(ring.append)
 STOCHASTIC, OF_EPISODES = "uniform:1:3@raw", "1+action=episode:choice:0=0.5,2=0.5"
+
+
+@functools.partial(jax.jit, static_argnames="longest")
+def seen_in(replay: ring.Replay, key: jax.Array, longest: int) -> tuple[Seen, Seen, jax.Array]:
+    """What `view` makes of sampled steps and of the next ones, and the steps' actions."""
+    windows = ring.sample(replay, key, 256, longest, 2, jnp.int32(0))
+    now, later = (jax.vmap(lambda window, k=k: view(window, k))(windows) for k in (0, 1))
+    return now, later, windows.action[:, longest, 0]
 
 
 @settings(max_examples=15, deadline=None)
@@ -37,15 +47,11 @@ def test_round_trip(channel: Channel, lag: DelayLaw, seed: int) -> None:
     longest = delay.maximum
     transitions, shown = record("delayrl/Counter-v0", delay, 90, seed)
     replay = ring.init(Spec(2, 1, longest), 200)
-    append = jax.jit(ring.append)
     for transition in transitions:
         replay = append(replay, transition)
-    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(
-        replay, jax.random.key(seed), 256, longest, 2, jnp.int32(0)
-    )
-    now, later = (jax.device_get(jax.jit(jax.vmap(lambda w, k=k: view(w, k)))(windows)) for k in (0, 1))
+    now, later, actions = jax.device_get(seen_in(replay, jax.random.key(seed), longest))
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
-    for i, action in enumerate(np.asarray(windows.action[:, longest, 0]).tolist()):
+    for i, action in enumerate(actions.tolist()):
         step = by_action[action]
         known = [(now, step)]
         if step + 1 < len(shown) and not transitions[step].done:
@@ -56,15 +62,17 @@ def test_round_trip(channel: Channel, lag: DelayLaw, seed: int) -> None:
             np.testing.assert_array_equal(seen.actions[i], shown[number].actions)
 
 
-@pytest.mark.parametrize("name", DELAYED)
-@pytest.mark.parametrize("delay", [STOCHASTIC, pytest.param(OF_EPISODES, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    ("name", "delay"),
+    [*((name, STOCHASTIC) for name in DELAYED), pytest.param("bpql", OF_EPISODES, marks=pytest.mark.thorough)],
+)
 def test_every_agent_learns_under_random_delays(name: str, delay: str) -> None:
     """Some updates on raw, unordered ages, or on another age in each episode: all finite, and the parameters move."""
     agent, observed = TINY[name], as_delay(delay).observed()
     longest = observed.maximum
     transitions, shown = record("Reacher-v5", observed, 170)
     assert {int(s.age) for s in shown} == {0, 1, 2, 3}
-    program = Program(agent, Spec(10, 2, longest))
+    program = program_of(agent, longest)
     keys = jax.vmap(jax.random.key)(jnp.arange(1))
     before = jax.device_get(program.init(keys, 200).agent)
     *_, (learner, metrics) = learned(program, keys, [transitions], 106)
