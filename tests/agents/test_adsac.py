@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conftest import learned, record
+from conftest import record
 from delayrl.agents.adsac import ADSAC, State, augmented_learner, with_augmented
 from delayrl.agents.sac import SAC
 from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.errors import DelayRLError
-from delayrl.training.learner import Program
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)
@@ -285,21 +284,3 @@ def test_auxiliary_delay_is_not_longer() -> None:
     ADSAC(TINY, DELAY).init(SPEC, jax.random.key(0))
     with pytest.raises(DelayRLError, match="no longer than the delay 3; got 4"):
         ADSAC(TINY, DELAY + 1).init(SPEC, jax.random.key(0))
-
-
-@pytest.mark.thorough
-def test_the_loop_repeats_itself() -> None:
-    """Through the jitted loop, τ = 1: the same seed twice ends with the same parameters, all of them finite."""
-    agent, _ = started(1)
-    transitions, _ = record(ENV, DELAY, 40)
-
-    program = Program(agent, SPEC)
-
-    def run():
-        keys = jax.vmap(jax.random.key)(jnp.arange(1))
-        *_, (learner, metrics) = learned(program, keys, [transitions], 31, hidden=lambda step: DELAY, capacity=100)
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
-        return learner.agent
-
-    first = run()
-    assert same(first, run())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from conftest import learned, record
+from conftest import record
 from delayrl.agents import lifting
 from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import Lifting, lifting_loss, moments
@@ -20,7 +20,6 @@ from delayrl.core.networks import Gaussian
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import look
 from delayrl.errors import DelayRLError
-from delayrl.training.learner import compiled
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)
@@ -242,27 +241,3 @@ def test_hold_is_before_end() -> None:
         Lifting(lifting_end=800_001).for_run(Schedule(steps=800_000))
     with pytest.raises(DelayRLError, match="no later than lifting_end = 750000; got 800000"):
         Lifting(lifting_hold=800_000).init(SPEC, jax.random.key(0))
-
-
-def run(transitions, hidden: int):
-    program = compiled(TINY, SPEC)
-    keys = jax.vmap(jax.random.key)(jnp.arange(1))
-    last = len(transitions)
-    *_, (learner, metrics) = learned(program, keys, [transitions], last, hidden=lambda step: hidden, capacity=100)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((learner.agent, metrics)))
-    return learner.agent
-
-
-@pytest.mark.thorough
-def test_the_loop_repeats_itself_and_never_peeks() -> None:
-    """The same seed twice is the same; and what has not arrived may be anything."""
-    transitions, _ = record(ENV, DELAY, 40)
-    first = run(transitions, DELAY)
-    assert same(first, run(transitions, DELAY))
-    poison = np.full_like(transitions[0].obs, 1e6)
-    hidden = [*transitions]
-    for i in range(len(hidden) - DELAY, len(hidden)):
-        hidden[i] = hidden[i]._replace(next_obs=poison, reward=np.float32(-1e6))
-        if i > len(hidden) - DELAY:
-            hidden[i] = hidden[i]._replace(obs=poison)
-    assert same(first, run(hidden, DELAY))
