@@ -64,7 +64,7 @@ def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("delay", "update_after", "first"), [("20", 5, 22), ("5+reward=20", 5, 22), ("20", 60, 60), ("20", 0, 100)]
+    ("delay", "update_after", "first"), [("3", 2, 5), ("3+reward=20", 5, 22), ("3", 60, 60), ("3", 0, 100)]
 )
 def test_first_update(delay: str, update_after: int, first: int, tmp_path: Path) -> None:
     """At its step, at the end of the random ones if none is given, or as soon as a transition has arrived."""
@@ -199,11 +199,11 @@ def test_complete_run_is_given_back(vdpo: Run, monkeypatch) -> None:
 
 def test_several_seeds(tmp_path: Path) -> None:
     """Each seed has its own folder, and the same start states and random steps as when it is trained alone."""
-    runs = train("a-sac", tmp_path / "group", seeds=[3, 4], steps=150)
-    again = train("a-sac", tmp_path / "group", seeds=2, seed=3, steps=150)
+    runs = train("bpql", tmp_path / "group", seeds=[3, 4], steps=150)
+    again = train("bpql", tmp_path / "group", seeds=2, seed=3, steps=150)
     assert [run.path for run in again] == [run.path for run in runs]
     assert [run.path.name for run in runs] == ["seed3", "seed4"]
-    alone = train("a-sac", tmp_path / "alone", seed=4, steps=150)
+    alone = train("bpql", tmp_path / "alone", seed=4, steps=150)
     for a, b in zip(runs[1].rows(), alone.rows(), strict=True):
         assert a["reset_seed"] == b["reset_seed"]
         np.testing.assert_allclose(a["return"], b["return"], rtol=1e-3)
