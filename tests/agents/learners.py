@@ -31,6 +31,15 @@ def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=N
     return learner, metrics, keys
 
 
+def sampled(transitions, spec: Spec, batch: int, ahead: int) -> Window:
+    """Windows of a replay that holds transitions."""
+    replay, append = ring.init(spec, 300), jax.jit(ring.append)
+    for transition in transitions:
+        replay = append(replay, transition)
+    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+    return sample(replay, jax.random.key(0), batch, spec.delay, ahead, jnp.int32(0))
+
+
 def counted(delay: int, steps: int, batch: int, ahead: int, law: str | None = None):
     """Random play of the counter, under a random delay if there is a law, and windows of it."""
     transitions, _ = record("delayrl/Counter-v0", law or delay, steps)

@@ -56,10 +56,11 @@ def test_inputs_are_aligned(auxiliary_delay: int) -> None:
     windows = windows_of("delayrl/Counter-v0", Spec(2, 1, 4), 300)
     agent = ADSAC(auxiliary_delay=auxiliary_delay)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
+    taken = windows.action[:, 4, 0].tolist()
     for ahead in (0, windows.n_step):
-        inputs = agent.inputs(windows, ahead)
+        inputs = jax.device_get(agent.inputs(windows, ahead))  # reading single entries is slow in JAX
         for i in range(0, 300, 3):
-            step = by_action[float(windows.action[i, 4, 0])]
+            step = by_action[taken[i]]
             now, length = transitions[step].obs
             k = int(np.broadcast_to(ahead, 300)[i])
             for x, delay in ((inputs.auxiliary, auxiliary_delay), (inputs.augmented, 4)):

@@ -145,9 +145,9 @@ def test_acting_never_peeks(name: str, rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("name", list(HONEST))
 def test_unprivileged_behaviour_needs_no_truth(name: str, rng: np.random.Generator) -> None:
     agent = HONEST[name]
-    state = agent.init(Spec(OBS, ACT, 3), jax.random.key(0))
+    state = jax.eval_shape(functools.partial(agent.init, Spec(OBS, ACT, 3)), jax.random.key(0))
     assert not agent.privileged
-    agent.act(state, seen(3, 2, rng), jax.random.key(0), explore=True)
+    jax.eval_shape(functools.partial(agent.act, explore=True), state, seen(3, 2, rng), jax.random.key(0))
 
 
 @pytest.mark.parametrize("name", quick(HONEST, *DELAYED, "vdpo, behaviour delayed", "ad-sac, behaviour augmented"))

@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import ACT, OBS, counted, random_windows, record, same, seen, trained
+from learners import ACT, OBS, counted, random_windows, record, same, sampled, seen, trained
 
 from conftest import TINY
 from delayrl.agents.any_age import AnyAge, SecondAge, belief_loss
 from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.forecast import follow_changes, forecast_loss, forecasting, in_task_units
 from delayrl.core.objectives import soft_value
 from delayrl.core.sequence import sequence
@@ -46,6 +45,7 @@ def test_second_views(law: str | None, ages: SecondAge) -> None:
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     x = np.asarray(agent.second_view(windows, jax.random.key(1)))
     fresh = np.asarray(replace(agent, second_age="zero").second_view(windows, jax.random.key(1)))
+    windows = jax.device_get(windows)  # reading single entries is slow in JAX
     found: dict[int, list[int]] = {}
     for i, action in enumerate(np.asarray(windows.action[:, 4, 0]).tolist()):
         step = by_action[action]
@@ -79,10 +79,7 @@ def test_actor_gradient_by_hand(distance: str) -> None:
     """Half for each age, and the pull of the older policy towards the younger, which is held fixed."""
     agent = replace(AGENT, pull=distance)
     transitions, _ = record("Reacher-v5", 3, 80)
-    replay = ring.init(Spec(OBS, ACT, 3), 200)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    windows = ring.sample(replay, jax.random.key(0), 16, 3, 1, jnp.int32(0))
+    windows = sampled(transitions, Spec(OBS, ACT, 3), 16, 1)
     state = AGENT.init(Spec(OBS, ACT, 3), jax.random.key(0))
     older, critic_input = AGENT.bpql._inputs(windows, 0)
     younger = AGENT.second_view(windows, jax.random.key(2))

@@ -132,14 +132,14 @@ def test_released_formula_by_hand() -> None:
 def test_stretch_is_the_past_with_new_actions() -> None:
     """x_t is as recorded; x_{t+Δ} shows s_t with Δ new actions, drawn from the policy at the states between."""
     rolls, agent, actor = rolled("truncated")
-    windows = counter("truncated")
+    inputs = jax.jit(jax.vmap(lambda window: network_input(view(window), "augmented")))(counter("truncated"))
+    rolls, recorded, windows = jax.device_get((rolls, inputs, counter("truncated")))  # single entries are slow in JAX
     policy = jax.jit(agent.policy)
     whole = np.flatnonzero(np.asarray(rolls.steps) == DELAY)
     assert len(whole) > 50
     for i in whole[:40]:
         window = jax.tree.map(lambda x, i=i: x[i], windows)
-        recorded = view(window)
-        np.testing.assert_array_equal(rolls.x[i], network_input(recorded, "augmented"))
+        np.testing.assert_array_equal(rolls.x[i], recorded[i])
         x_last = np.asarray(rolls.x_last[i])
         np.testing.assert_array_equal(x_last[:2], window.obs[DELAY])
         new = x_last[2:-1]
@@ -148,7 +148,7 @@ def test_stretch_is_the_past_with_new_actions() -> None:
             age = int(window.age[DELAY + step])
             seen = np.zeros((DELAY, 1), np.float32)
             seen[:age, 0] = history[DELAY + step - age : DELAY + step]
-            x = Seen(window.obs[DELAY + step - age], jnp.int32(age), jnp.asarray(seen))
+            x = Seen(jnp.asarray(window.obs[DELAY + step - age]), jnp.int32(age), jnp.asarray(seen))
             mean, log_std = policy(actor, network_input(x, "augmented"))
             raw = np.arctanh(np.float64(new[step]))
             normal = -0.5 * ((raw - mean) / np.exp(log_std)) ** 2 - log_std - 0.5 * np.log(2 * np.pi)
@@ -158,10 +158,10 @@ def test_stretch_is_the_past_with_new_actions() -> None:
 
 def test_the_delay_holds_the_terminal_state_back() -> None:
     """Some values are learned after T, where x still shows a state before it; only those targets end in 0."""
-    rolls, _, _ = rolled("terminated")
     windows = counter("terminated")
-    ended = np.asarray(rolls.ended)
-    over = np.asarray(windows.terminated.any(1))
+    recorded = jax.jit(jax.vmap(lambda window: network_input(view(window), "augmented")))(windows)
+    rolls, windows = jax.device_get((rolled("terminated")[0], windows))  # reading single entries is slow in JAX
+    ended, over = rolls.ended, windows.terminated.any(1)
     assert not (ended & ~over).any()
     assert 0.35 < ended[over].mean() < 0.65
     np.testing.assert_array_equal(rolls.x[ended, 0], windows.obs[ended, DELAY, 0])  # s_t arrives at t + Δ
@@ -178,8 +178,7 @@ def test_the_delay_holds_the_terminal_state_back() -> None:
         np.testing.assert_allclose(
             rolls.log_prob[i, 0], normal - np.log(1 - np.float64(action) ** 2), rtol=1e-3, atol=1e-3
         )
-    recorded = [network_input(view(jax.tree.map(lambda x, i=i: x[i], windows)), "augmented") for i in range(600)]
-    np.testing.assert_array_equal(rolls.x[~ended], np.stack(recorded)[~ended])
+    np.testing.assert_array_equal(rolls.x[~ended], np.asarray(recorded)[~ended])
 
 
 @functools.cache
@@ -309,7 +308,7 @@ def test_a_stretch_counts_what_arrived_in_it(delay: str) -> None:
     replay = store(record("delayrl/Counter-v0", delay, 200)[0], COUNTER)
     windows = sample(replay, jax.random.key(0), 512, DELAY, DELAY, jnp.int32(0))
     actor = AGENT.init(COUNTER, jax.random.key(0)).actor
-    rolls = jax.jit(AGENT.roll)(actor, windows, jax.random.key(1))
+    rolls, windows = jax.device_get((jax.jit(AGENT.roll)(actor, windows, jax.random.key(1)), windows))
     earned = np.cumsum(np.arange(60))  # of the first c steps of an episode: 1 + 2 + … + c
     moment = np.asarray(windows.obs[:, DELAY, 0]).astype(int)
     checked = 0

@@ -205,7 +205,7 @@ def test_lifting_loss_is_of_one_step() -> None:
     state = TINY.init(SPEC, jax.random.key(0))
     # a reference that does not move, so that what it was compared with is known
     agent = dataclasses.replace(TINY, bpql=dataclasses.replace(TINY.bpql, actor_learning_rate=1e-12))
-    _, metrics = agent.update(state, windows(), jax.random.key(1), jnp.int32(0))
+    _, metrics = jax.jit(agent.update)(state, windows(), jax.random.key(1), jnp.int32(0))
     x, s = augmented(windows()), windows().obs[:, DELAY]
     delayed, reference = agent.bpql.policy(state.delayed.actor, x), agent.bpql.policy(state.reference.actor, s)
     np.testing.assert_allclose(metrics["lifting_loss"], lifting_loss(delayed, reference), rtol=1e-4)
@@ -216,7 +216,7 @@ def test_it_pulls_towards_the_updated_reference() -> None:
     bpql = dataclasses.replace(TINY.bpql, actor_learning_rate=0.1)
     agent = dataclasses.replace(TINY, bpql=bpql)
     state = agent.init(SPEC, jax.random.key(0))
-    new, metrics = agent.update(state, windows(), jax.random.key(1), jnp.int32(0))
+    new, metrics = jax.jit(agent.update)(state, windows(), jax.random.key(1), jnp.int32(0))
     x, s = augmented(windows()), windows().obs[:, DELAY]
     delayed = bpql.policy(state.delayed.actor, x)
     before, after = (lifting_loss(delayed, bpql.policy(r.actor, s)) for r in (state.reference, new.reference))

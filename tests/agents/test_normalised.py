@@ -46,8 +46,8 @@ def test_an_update_is_the_inner_agents_on_normalised_windows(name: str) -> None:
     normalised = (np.asarray(windows.obs) - states.mean(0)) / states.std(0)
     on_numbers = replace(windows, obs=jnp.asarray(np.where(np.asarray(windows.valid)[..., None], normalised, 0)))
     for phase, own in zip(inner.phases(), agent.phases(), strict=True):
-        expected, metrics = phase.update(state.agent, on_numbers, key, count)
-        state, measured = own.update(state, windows, key, count)
+        expected, metrics = jax.jit(phase.update)(state.agent, on_numbers, key, count)
+        state, measured = jax.jit(own.update)(state, windows, key, count)
         assert metrics.keys() == measured.keys()
         for a, b in zip(jax.tree.leaves(state.agent), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)

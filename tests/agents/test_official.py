@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import ACT, OBS, seen
+from learners import ACT, OBS, random_windows, sampled, seen
 
 import delayrl
 from conftest import TINY, TINY_SAC, record
@@ -73,18 +73,14 @@ def test_target_entropy_of_a_task(env: str, target: float) -> None:
     """-A in the task's units is -A - Σ log half range in scaled ones."""
     spec = spec_of(make(env, 0, rescale=True))
     assert spec == spec_of(make(env, 0))
-    windows = ring.sample(ring.init(spec, 4), jax.random.key(0), 1, 0, 1, jnp.int32(0))
-    windows = replace(windows, log_scale=spec.log_scale)
+    windows = random_windows(spec)
     assert replace(TINY_SAC, entropy_unit="task").target_entropy(windows) == pytest.approx(target, abs=1e-3)
     assert replace(TINY_SAC, entropy_unit="scaled").target_entropy(windows) == -spec.action_size
 
 
 def windows_of(log_scale: float):
-    transitions, _ = record("Reacher-v5", 0, 60)
-    replay = ring.init(Spec(OBS, ACT, 0), 100)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition._replace(reward=np.float32(0)))
-    return replace(ring.sample(replay, jax.random.key(0), 32, 0, 1, jnp.int32(0)), log_scale=log_scale)
+    transitions = [t._replace(reward=np.float32(0)) for t in record("Reacher-v5", 0, 60)[0]]
+    return replace(sampled(transitions, Spec(OBS, ACT, 0), 32, 1), log_scale=log_scale)
 
 
 def test_entropy_in_values_and_temperature() -> None:
@@ -93,16 +89,16 @@ def test_entropy_in_values_and_temperature() -> None:
     state = agent.init(Spec(OBS, ACT, 0), jax.random.key(0))
     zero = jax.tree.map(jnp.zeros_like, state.critic)
     state = state._replace(critic=zero, target=zero)
-    ends = [agent.update(state, windows_of(scale), jax.random.key(1), jnp.int32(0)) for scale in (0.0, 2.0)]
-    (_, plain), (moved, scaled) = ends
+    scales = (0.0, 2.0, -9.0)
+    ends = [agent.update(state, windows_of(scale), jax.random.key(1), jnp.int32(0)) for scale in scales]
+    (_, plain), (_, scaled), _ = ends
     assert float(scaled["entropy"] - plain["entropy"]) == pytest.approx(2.0, abs=1e-5)
     policy = agent.policy(state.actor, windows_of(0.0).obs[:, 1])
     _, log_prob = networks.sample(policy, jax.random.split(jax.random.key(1))[0])
     target = -0.99 * (np.asarray(log_prob) - 2.0)
     assert float(scaled["critic_loss"]) == pytest.approx(2 * (target**2).mean(), rel=1e-5)
     # Adam's first step goes by the sign of the gradient: down while the entropy is above its target
-    for scale in (0.0, 2.0, -9.0):
-        moved, _ = agent.update(state, windows_of(scale), jax.random.key(1), jnp.int32(0))
+    for scale, (moved, _) in zip(scales, ends, strict=True):
         entropy = float(plain["entropy"]) + scale
         assert (float(moved.log_temperature) > 0) == (entropy < -ACT), scale
 
@@ -202,7 +198,8 @@ def test_what_is_learned_from() -> None:
         append = jax.jit(ring.append, static_argnames="learnable")
         for step in steps:
             replay = append(replay, step, learnable)
-        windows = ring.sample(replay, jax.random.key(0), 5000, DELAY, 3, jnp.int32(0))
+        sample = jax.jit(ring.sample, static_argnums=(2, 3, 4), static_argnames="learnable")
+        windows = sample(replay, jax.random.key(0), 5000, DELAY, 3, jnp.int32(0))
         drawn = set(np.asarray(windows.action[:, DELAY, 0]).tolist())
         expected = {action for action, t in first_action.items() if allowed(t)}
         unfinished = {float(t.action[0]) for t in transitions[-3:]}

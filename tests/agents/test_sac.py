@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from learners import ACT, ENV, OBS, counted, random_windows, same, seen, trained
+from learners import ACT, ENV, OBS, counted, random_windows, same, sampled, seen, trained
 
 from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS
 from delayrl.agents.sac import SAC, State
 from delayrl.agents.vdpo import VDPO
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.types import Spec
 from delayrl.errors import DelayRLError
 
@@ -76,8 +75,9 @@ def test_memoryless_sees_no_actions(rng: np.random.Generator) -> None:
 def test_bpql_is_aligned() -> None:
     """On a counter: critics at (s_t, a_t) with t the true step, the actor at s_{t-d} with the actions since."""
     transitions, windows = counted(2, 80, batch=500, ahead=1)
-    actor, critic = TINY["bpql"]._inputs(windows, 0)
-    actor_next, critic_next = TINY["bpql"]._inputs(windows, windows.n_step)
+    pairs = [TINY["bpql"]._inputs(windows, ahead) for ahead in (0, windows.n_step)]
+    windows, pairs = jax.device_get((windows, pairs))  # reading single entries is slow in JAX
+    (actor, critic), (actor_next, critic_next) = pairs
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     for i in range(500):
         step = by_action[float(windows.action[i, 2, 0])]
@@ -102,13 +102,10 @@ def test_sac_needs_the_current_state() -> None:
 def test_actor_and_temperature_move_every_second_time() -> None:
     """Twice on the odd counts, not at all on the even ones; critics and targets always."""
     transitions, _ = record(ENV, 0, 40)
-    replay = ring.init(Spec(OBS, ACT, 0), 100)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    windows = ring.sample(replay, jax.random.key(0), 16, 0, 3, jnp.int32(0))
-    state = TINY_SAC.init(Spec(OBS, ACT, 0), jax.random.key(0))
-    even, _ = TINY_SAC.update(state, windows, jax.random.key(1), jnp.int32(4))
-    odd, _ = TINY_SAC.update(state, windows, jax.random.key(1), jnp.int32(5))
+    windows = sampled(transitions, Spec(OBS, ACT, 0), 16, 3)
+    state, update = TINY_SAC.init(Spec(OBS, ACT, 0), jax.random.key(0)), jax.jit(TINY_SAC.update)
+    even, _ = update(state, windows, jax.random.key(1), jnp.int32(4))
+    odd, _ = update(state, windows, jax.random.key(1), jnp.int32(5))
     assert same(even.actor, state.actor)
     assert same(even.log_temperature, state.log_temperature)
     assert not same(even.critic, state.critic)

@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import ACT, ENV, OBS, counted, random_windows, same, seen
+from learners import ACT, ENV, OBS, counted, random_windows, same, sampled, seen
 
 from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS
 from delayrl.agents.vdpo import VDPO, Unseen, unseen
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.networks import Gaussian
 from delayrl.core.types import Spec
 from delayrl.core.views import network_input
@@ -48,7 +47,7 @@ def test_bfloat16_products_are_close(monkeypatch) -> None:
 def test_unseen_is_what_the_delay_hides() -> None:
     """x_{t+1}: the states after its observation, in order, up to s_{t+1}; fewer at the start of an episode."""
     transitions, windows = counted(4, 150, batch=400, ahead=3)
-    x = unseen(windows)
+    x, windows = jax.device_get((unseen(windows), windows))  # reading single entries is slow in JAX
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     for i in range(400):
         step = by_action[float(windows.action[i, 4, 0])]
@@ -64,11 +63,7 @@ def test_unseen_is_what_the_delay_hides() -> None:
 def vdpo_parts(agent: VDPO, delay: int = 3):
     transitions, _ = record(ENV, delay, 60)
     spec = Spec(OBS, ACT, delay)
-    replay = ring.init(spec, 100)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    windows = ring.sample(replay, jax.random.key(0), 16, delay, 3, jnp.int32(0))
-    return agent.init(spec, jax.random.key(0)), windows
+    return agent.init(spec, jax.random.key(0)), sampled(transitions, spec, 16, 3)
 
 
 @pytest.mark.parametrize("representation", ["transformer", "transformer-no-belief", "mlp"])

@@ -23,6 +23,7 @@ SPEC = Spec(10, 2, 3)
 AGENT = crossq.CrossQ(
     actor_sees="augmented", hidden=(8, 8), batch_size=16, actor_every=1, n_steps=3, entropy_unit="scaled", momentum=0.9
 )
+update = jax.jit(AGENT.update)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def windows() -> Window:
     replay = ring.init(SPEC, 200)
     for transition in transitions:
         replay = jax.jit(ring.append)(replay, transition)
-    return ring.sample(replay, jax.random.key(0), 16, 3, 3, jnp.int32(0))
+    return jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 16, 3, 3, jnp.int32(0))
 
 
 def written_out(critic: dict, x: np.ndarray) -> np.ndarray:
@@ -74,7 +75,7 @@ def test_folded_critic_has_the_moments_in_its_layers() -> None:
 def test_update_by_hand(windows: Window) -> None:
     """The critics' step follows a loss whose targets are numbers, from the same pass over both batches."""
     state, key = AGENT.init(SPEC, jax.random.key(1)), jax.random.key(2)
-    after, metrics = AGENT.update(state, windows, key, jnp.int32(0))
+    after, metrics = update(state, windows, key, jnp.int32(0))
     actor_next, later = AGENT._inputs(windows, windows.n_step)
     _, now = AGENT._inputs(windows, 0)
     action, log_prob = networks.sample(AGENT.policy(state.actor, actor_next), jax.random.split(key)[0])
@@ -90,7 +91,7 @@ def test_update_by_hand(windows: Window) -> None:
         q = jnp.stack([crossq.in_training(critic, jnp.asarray(both))[0][:16] for critic in critics])
         return ((q - y) ** 2).mean(-1).sum()
 
-    value, gradient = jax.value_and_grad(loss)(state.critic)
+    value, gradient = jax.jit(jax.value_and_grad(loss))(state.critic)
     np.testing.assert_allclose(metrics["critic_loss"], value, rtol=1e-4)
     change, _ = optax.adam(1e-3).update(gradient, state.critic_opt_state)
     expected = optax.apply_updates(state.critic, change)
@@ -108,7 +109,7 @@ def test_update_by_hand(windows: Window) -> None:
 def test_actor_climbs_the_folded_critic(windows: Window) -> None:
     """Its step is SAC's on plain critics that have the running moments in their layers."""
     state = AGENT.init(SPEC, jax.random.key(1))
-    after, _ = AGENT.update(state, windows, jax.random.key(2), jnp.int32(0))
+    after, _ = update(state, windows, jax.random.key(2), jnp.int32(0))
     critics = [crossq.folded(*pair) for pair in zip(after.critic, after.target, strict=True)]
     expected = state._replace(critic=critics)
     actor_input, critic_input = AGENT._inputs(windows, 0)

@@ -1,5 +1,6 @@
 """The transformer against an independent NumPy implementation, its causality, and densities against SciPy."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +20,10 @@ from delayrl.core.transformer import dropout, dropout_masks, threefry, transform
 SIZES = {"obs_size": 5, "action_size": 3, "length": 6, "width": 16, "layers": 3}
 
 
+plain_transformer = jax.jit(transformer, static_argnums=3)
+
+
+@functools.cache
 def random_params(seed: int = 0) -> networks.Params:
     """All parameters away from their initial values, so that no term hides."""
     params = transformer_init(jax.random.key(seed), **SIZES)
@@ -64,7 +69,7 @@ def numpy_transformer(params: networks.Params, obs: np.ndarray, actions: np.ndar
 def test_transformer_equals_numpy(rng: np.random.Generator) -> None:
     params = random_params()
     obs, actions = rng.normal(size=(4, 5)), rng.normal(size=(4, 6, 3))
-    ours = transformer(params, jnp.asarray(obs), jnp.asarray(actions))
+    ours = plain_transformer(params, jnp.asarray(obs), jnp.asarray(actions))
     for i in range(4):
         np.testing.assert_allclose(ours[i], numpy_transformer(params, obs[i], actions[i]), rtol=2e-4, atol=2e-4)
 
@@ -73,35 +78,36 @@ def test_position_sees_only_its_past(rng: np.random.Generator) -> None:
     """Position i depends on every action 0..i and on none after it: padding has no influence."""
     params = random_params()
     obs, actions = jnp.asarray(rng.normal(size=5)), jnp.asarray(rng.normal(size=(6, 3)))
-    slope = jax.jacobian(lambda a: transformer(params, obs, a))(actions)  # [i, width, j, action]
-    depends = np.abs(np.asarray(slope)).max((1, 3)) > 1e-6
+    by_obs, by_actions = jax.jit(jax.jacobian(transformer, (1, 2)))(params, obs, actions)
+    depends = np.abs(np.asarray(by_actions)).max((1, 3)) > 1e-6  # [i, width, j, action]
     np.testing.assert_array_equal(depends, np.tril(np.ones((6, 6), bool)))
-    assert (np.abs(np.asarray(jax.jacobian(lambda o: transformer(params, o, actions))(obs))).max((1, 2)) > 1e-6).all()
+    assert (np.abs(np.asarray(by_obs)).max((1, 2)) > 1e-6).all()
 
 
 def test_dropout_is_off_without_key(rng: np.random.Generator) -> None:
     params = random_params()
     obs, actions = jnp.asarray(rng.normal(size=(2, 5))), jnp.asarray(rng.normal(size=(2, 6, 3)))
-    plain = transformer(params, obs, actions)
-    np.testing.assert_array_equal(transformer(params, obs, actions, 0.5), plain)
-    dropped = transformer(params, obs, actions, 0.5, jax.random.key(0))
+    plain = plain_transformer(params, obs, actions)
+    np.testing.assert_array_equal(plain_transformer(params, obs, actions, 0.5), plain)
+    dropped = plain_transformer(params, obs, actions, 0.5, jax.random.key(0))
     assert np.abs(np.asarray(dropped - plain)).max() > 0.1
 
 
 def test_dropout_is_everywhere(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the embedding, and in each block of attention and of both residuals; each time with a mask of its own."""
-    masks = []
+    drawn = []
 
     def noted(kept: Any, rate: float, x: jax.Array) -> jax.Array:
-        masks.append(None if kept is None else (kept.shape, np.asarray(kept).tobytes()))
+        drawn.append(kept)
         return dropout(kept, rate, x)
 
     monkeypatch.setattr("delayrl.core.transformer.dropout", noted)
     obs, actions = jnp.asarray(rng.normal(size=(2, 5))), jnp.asarray(rng.normal(size=(2, 6, 3)))
-    transformer(random_params(), obs, actions, 0.5, jax.random.key(0))
+    params = random_params()
+    masks = jax.jit(lambda key: (transformer(params, obs, actions, 0.5, key), drawn)[1])(jax.random.key(0))
     stream, square = (2, 6, 16), (2, 6, 6)
-    assert [shape for shape, _ in masks] == [stream, *[square, stream, stream] * 3]
-    assert len(set(masks)) == 10
+    assert [mask.shape for mask in masks] == [stream, *[square, stream, stream] * 3]
+    assert len({(mask.shape, np.asarray(mask).tobytes()) for mask in masks}) == 10
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**31 + 5])
@@ -209,13 +215,13 @@ def test_gradients_of_a_layer(shape: tuple[int, ...]) -> None:
     x, w, b = (jnp.asarray(random.normal(size=size), jnp.float32) for size in (shape, (6, 3), 3))
 
     def gradients(layer: Callable[..., Any]) -> Callable[..., Any]:
-        return jax.grad(lambda x, w, b: jnp.sin(layer({"w": w, "b": b}, x)).sum(), (0, 1, 2))
+        return jax.jit(jax.grad(lambda x, w, b: jnp.sin(layer({"w": w, "b": b}, x)).sum(), (0, 1, 2)))
 
     halves = math.prod(shape[:-1]) in (4000, 5000, 12000)
     assert ("[2," in str(jax.make_jaxpr(linear)({"w": w, "b": b}, x))) == halves
     expected = gradients(lambda params, x: x @ params["w"] + params["b"])(x, w, b)
     alone = gradients(linear)(x, w, b)
-    seeds = jax.vmap(gradients(linear))(*(jnp.stack([0 * y, y]) for y in (x, w, b)))
+    seeds = jax.jit(jax.vmap(gradients(linear)))(*(jnp.stack([0 * y, y]) for y in (x, w, b)))
     for one, other, several in zip(expected, alone, seeds, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-3)
         np.testing.assert_allclose(one, several[1], rtol=1e-4, atol=2e-3)
@@ -233,7 +239,7 @@ def test_gradients_of_layer_norm(shape: tuple[int, ...]) -> None:
         return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(variance + 1e-5) * params["scale"] + params["shift"]
 
     def gradients(norm: Callable[..., Any]) -> Callable[..., Any]:
-        return jax.grad(lambda a, b, x: jnp.sin(norm({"scale": a, "shift": b}, x)).sum(), (0, 1, 2))
+        return jax.jit(jax.grad(lambda a, b, x: jnp.sin(norm({"scale": a, "shift": b}, x)).sum(), (0, 1, 2)))
 
     params = {"scale": scale, "shift": shift}
     program = str(jax.make_jaxpr(gradients(networks.layer_norm))(scale, shift, x))
@@ -241,7 +247,7 @@ def test_gradients_of_layer_norm(shape: tuple[int, ...]) -> None:
     np.testing.assert_allclose(networks.layer_norm(params, x), formula(params, x), rtol=1e-4, atol=1e-5)
     expected = gradients(formula)(scale, shift, x)
     alone = gradients(networks.layer_norm)(scale, shift, x)
-    seeds = jax.vmap(gradients(networks.layer_norm))(*(jnp.stack([0 * y, y]) for y in (scale, shift, x)))
+    seeds = jax.jit(jax.vmap(gradients(networks.layer_norm)))(*(jnp.stack([0 * y, y]) for y in (scale, shift, x)))
     for one, other, several in zip(expected, alone, seeds, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-5)
         np.testing.assert_allclose(one, several[1], rtol=1e-4, atol=2e-5)
