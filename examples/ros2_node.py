@@ -2,10 +2,11 @@
 
 python examples/ros2_node.py --ros-args -p policy:=BUNDLE -p on_overrun:=raise -p idle:="[0.0, 0.0]"
 
-Further parameters: `action_delay` and `dt`; a value below 0 (the default) stands for the policy's own. `idle` is what
-the drives do in a period without a command; by default they go on with the command before. While the newest observation
-is too old for the policy, no command is published (`on_overrun`: `raise`; or `hold`, `clip`). If the clock steps back,
-a new episode begins, whose history assumes that the drives were idle: stop the robot before you set its clock.
+Further parameters: `action_delay`, `min_age` and `dt`; a value below 0 (the default) stands for the policy's own.
+`idle` is what the drives do in a period without a command; by default they go on with the command before. While the
+newest observation is too old for the policy, no command is published (`on_overrun`: `raise`; or `hold`, `clip`). If the
+clock steps back, a new episode begins, whose history assumes that the drives were idle: stop the robot before you set
+its clock.
 
 The observation is [position…, velocity…] of the JointState, in the order of the policy's task. Its age comes from
 `header.stamp`, which must be the time of the measurement on the clock of this node (`use_sim_time` works). rclpy comes
@@ -25,7 +26,7 @@ REPORT_EVERY = 10.0  # seconds
 
 
 def make_node(policy: ControlPolicy, **settings: Any) -> Any:
-    """Make the node; `settings` go to the controller: on_overrun, action_delay, dt, idle."""
+    """Make the node; `settings` go to the controller: on_overrun, action_delay, min_age, dt, idle."""
     from rclpy.node import Node
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import JointState
@@ -77,7 +78,7 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
             self.get_logger().info(
                 f"effective delay {s.age_mean:.2f} ± {s.age_std:.2f} steps ({s.delay_mean * 1e3:.1f} ± "
                 f"{s.delay_std * 1e3:.1f} ms), period {s.period_mean * 1e3:.1f} ± {s.period_std * 1e3:.1f} ms; "
-                f"{s.overruns} overruns, {s.missed} missed, of {s.decisions}"
+                f"{s.held} held back, {s.overruns} overruns, {s.missed} missed, of {s.decisions}"
             )
 
     return DelayedPolicy()
@@ -86,9 +87,10 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
 def settings_of(node: Any) -> dict[str, Any]:
     """Return the parameters as `make_node` takes them, and `policy`."""
     # ROS infers the types of parameters from their defaults, and an empty list has none: NaN stands for no idle action
-    defaults = {"policy": "", "on_overrun": "raise", "action_delay": -1, "dt": -1.0, "idle": [math.nan]}
+    defaults = {"policy": "", "on_overrun": "raise", "action_delay": -1, "min_age": -1, "dt": -1.0}
+    defaults["idle"] = [math.nan]
     values = {name: node.declare_parameter(name, default).value for name, default in defaults.items()}
-    for name in ("action_delay", "dt"):
+    for name in ("action_delay", "min_age", "dt"):
         values[name] = None if values[name] < 0 else values[name]
     values["idle"] = None if np.isnan(values["idle"]).any() else list(values["idle"])
     return values

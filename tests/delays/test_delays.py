@@ -230,6 +230,7 @@ def test_a_delay_in_the_other_unit(value: DelayLike, step: float, words: str) ->
     [
         *(("0", 0), ("4", 4), ("uniform:2:4", 2), ("uniform:2:4@wait", 4), ("uniform:2:4@raw", 2), ("poisson:2:5", 0)),
         *(("gilbert:3:1:0.2:0.4", 1), ("walk:8", 0), ("recorded:4,2,6,", 2), ("paper-stochastic-5", 1)),
+        *(("gamma:20:2:30", 15), ("choice:0=0,5=1", 5), ("walk:3:0.5+action=2", 2)),
         *(("episode:2:4", 2), ("80~15", 80), ("2+action=3+reward=1", 5), ("uniform:1:3+action=episode:2:4", 3)),
     ],
 )
@@ -237,8 +238,8 @@ def test_the_shortest_age(text: str, shortest: int) -> None:
     delay = as_delay(text)
     assert delay.minimum == shortest
     assert delay.observed().minimum == shortest
-    random = np.random.default_rng(0)
-    assert all(delay.observed().observation.law.draw(0, random)[0] >= shortest for _ in range(50)) or "@wait" in text
+    law, random = delay.observed().observation.law, np.random.default_rng(0)
+    assert all(law.draw(0, random)[0] >= shortest for _ in range(50)) or "@wait" in text
 
 
 def test_channels_of_a_text() -> None:

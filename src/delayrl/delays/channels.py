@@ -16,6 +16,8 @@ Rule = Literal["newest", "fifo", "raw", "wait"]
 are ignored. `fifo`: the same, but no message overtakes another. `raw`: s_{t-d} with d drawn anew at each step, so that
 the observation may go back in time. `wait`: each message counts once the longest delay has passed since it was sent."""
 NO_DELAY = Constant(0)
+RARE = 1e-3
+"""Delays that are less probable do not count as those that a policy learns from."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Channel:
 
     @property
     def minimum(self) -> int:
-        """The shortest delay, even if its probability is 0."""
+        """The shortest delay, but for such as come less than once in a thousand messages."""
         return self.maximum if self.rule == "wait" else _shortest(self.law)
 
     @property
@@ -93,7 +95,7 @@ class Delay:
 
     @property
     def minimum(self) -> int:
-        """The age that every observation has at least, once the first of the episode has it."""
+        """The least age of observations: of their and the actions' shortest delays."""
         return self.observation.minimum + self.action.minimum
 
     @property
@@ -153,13 +155,21 @@ class Delay:
 
 
 def _shortest(law: DelayLaw) -> int:
-    if isinstance(law, PerEpisode):
-        return _shortest(law.law)
-    if isinstance(law, Sum):
-        return _shortest(law.law) + _shortest(law.episode)
-    if isinstance(law, OwnLaw):
-        return law.later  # its own shortest is unknown
-    return law.steps if isinstance(law, Constant) else min(law.steps)  # type: ignore[attr-defined]  # all that remain
+    match law:
+        case Constant():
+            return law.steps
+        case laws.Choice() | laws.Markov():
+            shares = law.probabilities if isinstance(law, laws.Choice) else law.stationary
+            return min(steps for steps, share in zip(law.steps, shares, strict=True) if share >= RARE)
+        case laws.Recorded():
+            return min(law.steps)
+        case PerEpisode():
+            return _shortest(law.law)
+        case Sum():
+            return _shortest(law.law) + _shortest(law.episode)
+        case OwnLaw():
+            return law.later  # its own shortest is unknown
+    return 0
 
 
 def short_label(text: int | str) -> int | str:

@@ -205,11 +205,10 @@ def evaluate(
         config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)
         policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
         learned = policy.min_age(usual)
-    result = _play(policy, name, task, usual if delay is None else delay, episodes, seed)
-    if delay is not None and delay_of(task, delay).minimum < learned:
-        line = f"{name} learned no age below {learned} steps, and delay {result['delay']} shows younger ones"
+    if delay is not None and (played := delay_of(task, delay)).minimum < learned:
+        line = f"{name} learned no age below {learned} steps, and delay {played.label()} shows younger ones"
         warnings.warn(f"{line}; a Controller holds these back", DelayWarning, stacklevel=2)
-    return result
+    return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
 
 def sweep(

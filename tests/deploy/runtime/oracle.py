@@ -67,12 +67,14 @@ class Oracle:
     # ("obs", stamp, content) | ("command", now, action) | ("fix", step, action), as far as they were accepted
     log: list[tuple[str, float, float]] = field(default_factory=list)
     shown: float = -math.inf  # the stamp of the observation that was shown last in this episode
+    latest: float = -math.inf  # the latest time that an observation came at
     tally: dict[str, int] = field(default_factory=dict)
     ages: list[int] = field(default_factory=list)
     delays: list[float] = field(default_factory=list)
     periods: list[float] = field(default_factory=list)
     missed: int = 0
     replaced: int = 0
+    held: int = 0
 
     def __post_init__(self) -> None:
         self.start = None if self.setting.seconds else 0.0
@@ -130,24 +132,33 @@ class Oracle:
 
     def observe(self, content: float, stamp: float, now: float, episode: int | None) -> str:
         seen = self.observations()
+        in_episode = episode in (None, self.episode) and (self.start is None or stamp >= self.start)
         if not abs(content) <= 3.4e38 or not abs(stamp) <= 1e15 or (stamp < 0 and not self.setting.seconds):
             verdict = "invalid"
-        elif (episode is not None and episode != self.episode) or (self.start is not None and stamp < self.start):
+        elif not in_episode:
             verdict = "late"
         elif stamp - now > self.setting.period / 2:
             verdict = "future"
-        elif seen and stamp == max(seen)[0]:
+        elif any(stamp == other for other, _ in seen if other >= self.held_from()):
             verdict = "duplicate"
-        elif seen and stamp < (self.shown if self.setting.min_age else max(seen)[0]):
+        elif stamp < self.held_from() or (self.holds() and now < self.latest - self.setting.period / 2):
             verdict = "late"
-        elif self.setting.min_age and any(stamp == other for other, _ in seen):
-            verdict = "duplicate"
         else:
             verdict = "new"
             self.log.append(("obs", stamp, content))
             self.start = stamp if self.start is None else self.start
+        if verdict != "invalid" and not (verdict == "late" and not in_episode):
+            self.latest = max(self.latest, now)
         self.count(verdict)
         return verdict
+
+    def held_from(self) -> float:
+        """The stamp that an observation must not be older than."""
+        newest = max((stamp for stamp, _ in self.observations()), default=-math.inf)
+        return self.shown if self.holds() else newest
+
+    def holds(self) -> bool:
+        return self.setting.min_age > 0 and self.commands() != []
 
     def forward(self, now: float) -> None:
         if not abs(now) <= 1e15 or (now < 0 and not self.setting.seconds) or any(c >= now for c in self.commands()):
@@ -167,7 +178,11 @@ class Oracle:
             nearest = min(range(len(begins)), key=lambda j: (abs(begins[j] - stamp), -j))
             return min(nearest, len(begins) - 1 - self.setting.action_delay)
 
-        waiting = sorted(seen for seen in self.observations() if seen[0] >= self.shown)  # the last shown too
+        newest_stamp, _ = newest = max(self.observations())
+        newest_age = len(begins) - 1 - step_of(newest_stamp)
+        waiting = [newest]
+        if self.holds():
+            waiting = sorted(seen for seen in self.observations() if seen[0] >= self.shown)
         old = [seen for seen in waiting if len(begins) - 1 - step_of(seen[0]) >= self.setting.min_age]
         young = waiting[max(1, len(old)) :]
         stamp, content = max(old) if old else min(waiting)
@@ -179,13 +194,16 @@ class Oracle:
             self.count("overruns")
             if self.setting.on_overrun == "raise":
                 raise OverrunError
-        if self.commands() and step > self.before(self.commands()[0]):
-            self.ages.append(age)
-            self.delays.append(now - stamp)
+        self.held += age > newest_age
+        if self.commands() and step_of(newest_stamp) > self.before(self.commands()[0]):
+            self.ages.append(newest_age)
+            self.delays.append(now - newest_stamp)
             self.periods += [now - max(self.commands())]
         return age, content, actions[step:], [*past, *actions[len(past) :]]
 
     def command(self, now: float, action: float) -> None:
+        if not self.commands():
+            self.shown = max((stamp for stamp, _ in self.observations()), default=-math.inf)
         self.log.append(("command", now, action))
         self.start = now if self.start is None else self.start
 
@@ -198,7 +216,7 @@ class Oracle:
         *_, missed, replaced = self.steps()
         self.missed, self.replaced = self.missed + missed, self.replaced + replaced
         self.episode, self.start, self.log = self.episode + 1, now if self.setting.seconds else 0.0, []
-        self.shown = -math.inf
+        self.shown = self.latest = -math.inf
 
 
 def play(setting: Setting, events: list[Event]) -> dict[str, int]:
@@ -320,7 +338,8 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
         assert getattr(got, name) == oracle.tally.get(name, 0), name
     *_, missed, replaced = oracle.steps()
     assert (got.missed, got.replaced) == (oracle.missed + missed, oracle.replaced + replaced)
-    assert got.counted == len(oracle.ages)
+    assert (got.counted, got.held) == (len(oracle.ages), oracle.held)
+    happened["held"] = oracle.held
     if exact and oracle.ages:
         assert (got.age_min, got.age_max) == (min(oracle.ages), max(oracle.ages))
         moments = [("age", oracle.ages)]

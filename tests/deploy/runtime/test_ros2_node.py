@@ -121,7 +121,7 @@ def test_the_drive_is_idle_on_an_overrun(example: Any) -> None:
     node = Node("parameters")
     node.declare_parameter = lambda name, default: SimpleNamespace(value=given.get(name, default))
     settings = example.settings_of(node)
-    assert settings == given | {"policy": "", "on_overrun": "raise"}
+    assert settings == given | {"policy": "", "on_overrun": "raise", "min_age": None}
     settings.pop("policy")
     node = example.make_node(policy, **settings)
     node.subscribed["joint_states"](joint_state([0.0], [0.0], Node.now))
@@ -156,7 +156,7 @@ def test_parameters_left_out_are_the_policys_own(example: Any) -> None:
     node.declare_parameter = lambda name, default: SimpleNamespace(value=default)
     assert example.settings_of(node) == {
         **{"policy": "", "on_overrun": "raise"},
-        **dict.fromkeys(("action_delay", "dt", "idle")),
+        **dict.fromkeys(("action_delay", "min_age", "dt", "idle")),
     }
 
 

@@ -84,7 +84,7 @@ class Controller:
         action_delay: steps from a command to its effect, κ, which is part of the age. None for the policy's own
             `action_delay`, or 0 if it has none.
         min_age: steps that observations are held back for, so that the policy is shown no younger age than it knows;
-            the first of an episode is shown at once. None for the policy's own `min_age`, or 0 if it has none.
+            for the first command, the newest is shown. None for the policy's own `min_age`, or 0 if it has none.
         on_overrun: what `act` does while the newest observation is too old for the policy; see `OnOverrun`.
         idle: what the plant does in a step without a command, [A]. None if it goes on with the action before. Before
             the first it then does the policy's own `idle`, or zeros if it has none, clipped to the range.
@@ -214,10 +214,7 @@ class Controller:
             else:
                 action = _in_range(policy, shown.held)
             with self._state_lock:
-                period = self._episode.record(action, now)
-                self._telemetry.counts["decisions"] += 1
-                if shown.warm:
-                    self._telemetry.add(age, shown.delay, period)
+                self._telemetry.decided(shown, self._episode.record(action, now))
         return action.copy()
 
     def override(self, action: ArrayLike, now: float | None = None) -> None:

@@ -5,7 +5,7 @@ Steps are numbered from the start of the episode. Only the newest ones are remem
 
 import math
 import operator
-from bisect import bisect_right, insort
+from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
@@ -167,13 +167,14 @@ class History:
 
 
 class Shown(NamedTuple):
-    """The observation that a command is chosen on, seen from that command."""
+    """The observation that a command is chosen on, and the newest one, seen from that command."""
 
     obs: NDArray[np.float64]
     age: int
     actions: list[Action]  # those since, oldest first; fewer than the age if the oldest are no longer remembered
-    delay: float  # the time from the stamp to the command
-    warm: bool  # whether the observation was made after the first command
+    newest_age: int
+    newest_delay: float  # the time from the newest's stamp to the command
+    warm: bool  # whether the newest was made after the first command
     held: Action  # what the plant does if it gets no new command
 
 
@@ -194,6 +195,7 @@ class Episode:
         self._start, self._clock, self._min_age, self._max_age = start, clock, min_age, max_age
         self._kept: list[tuple[float, NDArray[np.float64]]] = []  # the one to show and those held back, by their stamps
         self._oldest = self._last_command = -math.inf  # the stamp that those to come must not be older than
+        self._latest = -math.inf  # the latest time that was told
         self._first_command: int | None = None  # in steps from the start
 
     @property
@@ -208,10 +210,15 @@ class Episode:
             insort(self._kept, (stamp, obs), key=_stamp)
             if self._start == -math.inf:
                 self._start = stamp
-            if not self._min_age:
+            if not self._holds:
                 self._oldest = stamp
-            del self._kept[: -MOST_HELD if self._min_age else -1]
+            del self._kept[: -MOST_HELD if self._holds else -1]
         return arrival
+
+    @property
+    def _holds(self) -> bool:
+        """Whether observations are held back: not before the first command, as training begins with a fresh one."""
+        return self._min_age > 0 and self._first_command is not None
 
     def command_time(self, now: float | None) -> float:
         """Return `now` as a float. Raises ClockError unless it is after the last command."""
@@ -232,17 +239,19 @@ class Episode:
             raise ClockError(f"now is {now:g}, more than half a step before the newest observation, made at {newest:g}")
         elapsed = self._elapsed(now)
 
-        def age(kept: tuple[float, Any]) -> int:
-            return self.history.age(kept[0], now, elapsed)[1]
+        def located(kept: tuple[float, Any]) -> tuple[int, int, list[Action]]:
+            return self.history.age(kept[0], now, elapsed)
 
+        step, newest_age, actions = located(self._kept[-1])
+        age = newest_age
         if len(self._kept) > 1:
-            index = max(0, bisect_right(self._kept, -self._min_age, key=lambda kept: -age(kept)) - 1)
-            index += index + 1 < len(self._kept) and age(self._kept[index]) > self._max_age
+            index = max(0, bisect_right(self._kept, -self._min_age, key=lambda kept: -located(kept)[1]) - 1)
+            index += index + 1 < len(self._kept) and located(self._kept[index])[1] > self._max_age
             del self._kept[:index]
+            _, age, actions = located(self._kept[0])
         self._oldest, obs = self._kept[0]
-        step, shown_age, actions = self.history.age(self._oldest, now, elapsed)
         warm = self._first_command is not None and step > self._first_command
-        return Shown(obs.copy(), shown_age, actions, now - self._oldest, warm, self.history.held(now, elapsed))
+        return Shown(obs.copy(), age, actions, newest_age, now - newest, warm, self.history.held(now, elapsed))
 
     def record(self, action: Action, now: float) -> float:
         """Add a command to the history. Returns the time since the last one, infinite for the first."""
@@ -262,11 +271,15 @@ class Episode:
             return "invalid"
         if (episode is not None and episode != self.number) or stamp < self._start:
             return "late"
-        if stamp > self._now(now) + self._clock.period / 2:
+        time = self._now(now)
+        self._latest = max(self._latest, time)
+        if stamp > time + self._clock.period / 2:
             return "future"
-        if any(stamp == kept for kept, _ in self._kept):
+        place = bisect_left(self._kept, stamp, key=_stamp)
+        if place < len(self._kept) and stamp == self._kept[place][0]:
             return "duplicate"
-        return "late" if stamp < self._oldest else "new"
+        back = self._holds and time < self._latest - self._clock.period / 2  # stamps repeat what was held back
+        return "late" if stamp < self._oldest or back else "new"
 
     def _now(self, now: float | None) -> float:
         return self._clock.now(now, max(0, self.history.length - self.history.lead))

@@ -4,16 +4,17 @@ import math
 from dataclasses import dataclass
 from typing import Any, get_args
 
-from delayrl.deploy.runtime.episode import Arrival, Stamps
+from delayrl.deploy.runtime.episode import Arrival, Shown, Stamps
 
 
 @dataclass(frozen=True)
 class Statistics:
     """Totals over all episodes since the controller was made.
 
-    `age_*`, `delay_*` and `period_*` leave out the cold start of an episode: they begin with the first decision whose
-    observation was made after the first command. Before, the age only shows how long the episode has run. Decisions
-    that `on_overrun="raise"` refuses appear in `overruns` only. The means and deviations are NaN while nothing has been
+    `age_*` and `delay_*` are those of the newest observation that had arrived at a decision, held back or not. Like
+    `period_*` they leave out the cold start of an episode: they begin with the first decision whose newest observation
+    was made after the first command. Before, the age only shows how long the episode has run. Decisions that
+    `on_overrun="raise"` refuses appear in `overruns` only. The means and deviations are NaN while nothing has been
     counted (`age_min` and `age_max` are 0), and `delay_*` and `period_*` are NaN with stamps in steps.
     """
 
@@ -27,6 +28,7 @@ class Statistics:
     delay_std: float
     period_mean: float  # seconds between two commands
     period_std: float
+    held: int  # decisions on an older observation than the newest, which `min_age` holds back
     overruns: int  # decisions with an age above the policy's longest, with refused ones and the cold start
     missed: int  # steps without a command of their own
     replaced: int  # commands that another one replaced less than half a period later
@@ -62,18 +64,22 @@ class Telemetry:
 
     def __init__(self, stamps: Stamps) -> None:
         self._stamps = stamps
-        names = ("decisions", "overruns", "missed", "replaced", "overridden", *get_args(Arrival))
+        names = ("decisions", "held", "overruns", "missed", "replaced", "overridden", *get_args(Arrival))
         self.counts = dict.fromkeys(names, 0)
         self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
         self._age_min = self._age_max = 0
 
-    def add(self, age: int, delay: float, period: float) -> None:
-        """Add a decision: the age in steps, the time since its observation was made and since the last command."""
-        self._age_min = min(self._age_min, age) if self._ages.count else age
-        self._age_max = max(self._age_max, age)
-        self._ages.add(age)
+    def decided(self, shown: Shown, period: float) -> None:
+        """Count a decision on what was shown, `period` after the last command."""
+        self.counts["decisions"] += 1
+        self.counts["held"] += shown.age > shown.newest_age
+        if not shown.warm:
+            return
+        self._age_min = min(self._age_min, shown.newest_age) if self._ages.count else shown.newest_age
+        self._age_max = max(self._age_max, shown.newest_age)
+        self._ages.add(shown.newest_age)
         if self._stamps == "seconds":
-            self._delays.add(delay)
+            self._delays.add(shown.newest_delay)
             self._periods.add(period)
 
     def snapshot(self) -> Statistics:
