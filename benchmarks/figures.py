@@ -335,7 +335,7 @@ def main() -> None:
         "reacher": ["docs/benchmarks.md"],
         "walk": ["docs/benchmarks.md"],
         "walk-random": ["docs/benchmarks.md"],
-        "pusher-random": ["docs/delays.md"],
+        "pusher-random": ["docs/benchmarks.md"],
     }.items():
         if (HERE / "results" / f"{name}.jsonl").exists():
             for page in pages:
