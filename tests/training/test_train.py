@@ -175,13 +175,15 @@ def test_damaged_configuration(tmp_path: Path) -> None:
     """Wrong types and missing names are one line."""
     run = train("random", tmp_path / "run", steps=120)
     good = run.config
-    missing = ({name: None} for name in ("protocol", "seed", "delay", "schedule"))
-    for change in ({"agent": ["vdpo"]}, {"env": 3}, {"hyperparameters": 7}, *missing):
+    for change in ({"agent": ["vdpo"]}, {"env": 3}, {"delay": None}, {"schedule": None}, {"hyperparameters": 7}):
         (run.path / "config.json").write_text(json.dumps(good | change))
         with pytest.raises(delayrl.DelayRLError, match="damaged"):
             delayrl.load(run.path)
     (run.path / "config.json").write_text(json.dumps(good | {"preset": "tiny"}))
     with pytest.raises(delayrl.DelayRLError, match="unknown preset 'tiny'"):
+        delayrl.go_on(run.path, 200)
+    (run.path / "config.json").write_text(json.dumps({k: v for k, v in good.items() if k not in ("protocol", "seed")}))
+    with pytest.raises(delayrl.DelayRLError, match="does not say its protocol and seed: the run cannot go on"):
         delayrl.go_on(run.path, 200)
 
 

@@ -27,10 +27,11 @@ from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, save_arrays
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
 from delayrl.run.disk import disk_errors, draft, lock, remove, write_file, write_flushed
-from delayrl.run.rows import CONDITION, check_row
+from delayrl.run.rows import check_row
 
 FORMAT = 1
-CONFIG: dict[str, Any] = {"format": int, **CONDITION, "seed": int, "hyperparameters": dict, "schedule": dict}
+NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
+CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")

@@ -59,6 +59,9 @@ def go_on(
     """
     runs = seed_folders(run)
     configs = [one.config for one in runs]
+    for one, config in zip(runs, configs, strict=True):
+        if lacks := [name for name in ("protocol", "seed") if name not in config]:
+            raise DelayRLError(f"{one.path}/config.json does not say its {' and '.join(lacks)}: the run cannot go on")
     task = stored_task(configs[0]["env"], runs[0].path, env)
     if agent is None:
         agent = str(configs[0]["agent"])
