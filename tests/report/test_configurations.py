@@ -54,6 +54,14 @@ def test_the_hash_is_of_all_options_and_of_nothing_else() -> None:
         assert resolve("bpql", "Pendulum-v1", 5, "small", "corrected", changed).configuration != base
 
 
+@pytest.mark.parametrize("schedule", [{}, None, []])
+def test_a_configuration_without_steps_is_one_line(schedule: Any, tmp_path: Path) -> None:
+    rows = made(tmp_path, 1.0)
+    config = RunFolder(tmp_path).config | {"schedule": schedule}
+    with pytest.raises(DelayRLError, match="of bpql on Pendulum-v1, delay 3 has no schedule with its steps"):
+        summarise(read_rows([rows]), [], [config])
+
+
 def test_runs_that_differ_in_an_option_are_two_results(tmp_path: Path) -> None:
     one = made(tmp_path / "a", 1.0), made(tmp_path / "b", 2.0, seed=1)
     other = made(tmp_path / "c", 30.0, discount=0.9), made(tmp_path / "d", 40.0, seed=1, discount=0.9)

@@ -1,4 +1,4 @@
-"""Evaluation: deterministic actions, a start state for each episode, one row for each episode and never a mean."""
+"""Evaluation: no exploration, a start state for each episode, one row for each episode and never a mean."""
 
 import contextlib
 import functools

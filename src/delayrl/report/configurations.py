@@ -36,6 +36,8 @@ def by_key(configs: Iterable[Config]) -> dict[Key, Config]:
     for config in configs:
         if "configuration" in config:
             condition = Condition.from_json({"overrides": {}, "steps": 0, **config})
+            if not isinstance(config.get("schedule"), dict) or "steps" not in config["schedule"]:
+                raise DelayRLError(f"the configuration of {condition} has no schedule with its steps")
             known[*condition.columns.values(), config["configuration"]] = config
     return known
 
