@@ -155,7 +155,8 @@ def _against_delay(results: list[Result], looks: dict[str, Look], path: Path) ->
 def _aggregates(aggregates: list[Aggregate], looks: dict[str, Look], path: Path) -> None:
     """IQM with its interval, and the performance profile beside it, a line for each delay."""
     delays = list(dict.fromkeys(a.delay for a in aggregates))
-    figure, panels = _panels(len(delays), 2, (9, 2.8 * len(delays) + 0.5))
+    longest = max(len(_plain(looks[a.label][0])) for a in aggregates)  # names stand beside the left panels
+    figure, panels = _panels(len(delays), 2, (8 + 0.08 * longest, 2.8 * len(delays) + 0.5))
     for (left, right), delay in zip(panels, delays, strict=True):
         mine = [a for a in aggregates if a.delay == delay]
         title = "all constant delays" if delay is None else f"Δ = {_plain(str(delay))}"
@@ -167,7 +168,7 @@ def _aggregates(aggregates: list[Aggregate], looks: dict[str, Look], path: Path)
             right.fill_between(THRESHOLDS, a.profile_low, a.profile_high, color=style["color"], alpha=0.12, lw=0)
         left.set_yticks(range(len(mine)), [_plain(looks[a.label][0]) for a in reversed(mine)])
         left.set(title=f"IQM, {title}", xlabel="normalised return", ylim=(-0.6, len(mine) - 0.4))
-        right.set(title=f"Performance profile, {title}", xlabel="normalised return τ", ylabel="runs above τ")
+        right.set(title=f"Profile, {title}", xlabel="normalised return τ", ylabel="runs above τ")
         for panel in (left, right):
             panel.title.set_fontsize(10)
     _save(figure, path)
