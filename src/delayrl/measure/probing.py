@@ -12,7 +12,7 @@ that `step(a)` returns reacts to that a.
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from operator import itemgetter
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from delayrl.envs.making import name_of
-from delayrl.envs.task import TaskLike, as_task
+from delayrl.envs.task import TaskLike, as_task, closing
 from delayrl.errors import DelayRLError, described
 from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push
 
@@ -85,17 +85,13 @@ def probe(
     """
     if episodes < 1 or longest < 1:
         raise DelayRLError(f"episodes and longest count from 1; got {episodes} and {longest}")
-    task = env if isinstance(env, gym.Env) else as_task(env).make()
-    try:
-        return _probe(task, episodes, seed, longest, wrap)
-    except DelayRLError:
-        raise
-    except Exception as error:  # an environment may raise anything
-        raise DelayRLError(f"{task} failed while it was played: {described(error)}") from error
-    finally:
-        if task is not env:
-            with suppress(Exception):  # it changes no result
-                task.close()
+    with nullcontext(env) if isinstance(env, gym.Env) else closing(as_task(env).make()) as task:
+        try:
+            return _probe(task, episodes, seed, longest, wrap)
+        except DelayRLError:
+            raise
+        except Exception as error:  # an environment may raise anything
+            raise DelayRLError(f"{task} failed while it was played: {described(error)}") from error
 
 
 def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Iterable[int]], Iterable[int]]) -> Probed:

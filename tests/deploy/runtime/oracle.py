@@ -169,7 +169,8 @@ class Oracle:
         self.forward(now)
         if not self.observations():
             raise DelayRLError
-        if max(self.observations())[0] - now > self.setting.period / 2:
+        newest_stamp, _ = newest = max(self.observations())
+        if newest_stamp - now > self.setting.period / 2:
             raise ClockError
         begins, actions, *_ = self.steps(now)
         past = self.steps()[1]
@@ -178,7 +179,6 @@ class Oracle:
             nearest = min(range(len(begins)), key=lambda j: (abs(begins[j] - stamp), -j))
             return min(nearest, len(begins) - 1 - self.setting.action_delay)
 
-        newest_stamp, _ = newest = max(self.observations())
         newest_age = len(begins) - 1 - step_of(newest_stamp)
         waiting = [newest]
         if self.holds():

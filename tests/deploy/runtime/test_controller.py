@@ -90,6 +90,14 @@ class Recorder:
         return self.rng.uniform(self.low, self.high).astype(np.float32)
 
 
+def assert_shown(policy: Recorder, obs: np.ndarray, info: dict) -> None:
+    """The policy was shown what the wrapper shows."""
+    got_obs, got_actions, got_age = policy.shown[-1]
+    np.testing.assert_array_equal(got_obs, obs)
+    np.testing.assert_array_equal(got_actions, info["actions"])
+    assert got_age == info["age"]
+
+
 @pytest.mark.parametrize("stamps", ["steps", "seconds"])
 @pytest.mark.parametrize("first", [0, 3])
 @pytest.mark.parametrize("delay", ["0", "1", "5", "uniform:0:4", "gilbert:1:5:0.2:0.4@fifo", "uniform:0:3+action=2"])
@@ -125,10 +133,7 @@ def test_shows_what_the_wrapper_shows(stamps: str, delay: str, first: int) -> No
                 if stamps == "steps" or k == shown:
                     controller.observe(mailbox[k], stamp, now)
             action = controller.act(now)
-            got_obs, got_actions, got_age = policy.shown[-1]
-            np.testing.assert_array_equal(got_obs, obs)
-            np.testing.assert_array_equal(got_actions, info["actions"])
-            assert got_age == info["age"]
+            assert_shown(policy, obs, info)
             obs, _, _, _, info = env.step(action)
 
 
@@ -152,10 +157,7 @@ def test_holds_back_as_the_wrapper_waits(delay: str) -> None:
                 if arrival == step:
                     assert controller.observe(values, k, step) == "new"
             action = controller.act(step)
-            got_obs, got_actions, got_age = policy.shown[-1]
-            np.testing.assert_array_equal(got_obs, obs)
-            np.testing.assert_array_equal(got_actions, info["actions"])
-            assert got_age == info["age"]
+            assert_shown(policy, obs, info)
             obs, _, _, _, info = env.step(action)
     assert controller.statistics.held > 100
     assert controller.statistics.late == 0
