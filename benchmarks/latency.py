@@ -22,9 +22,10 @@ from figures import HERE, insert
 from delayrl.agents.registry import AGENTS
 from delayrl.core.types import Spec
 from delayrl.deploy.bundle import BACKENDS
-from delayrl.deploy.export import bundle_files
+from delayrl.deploy.export import network_of
 from delayrl.deploy.files import write_files
 from delayrl.deploy.latency import latency
+from delayrl.deploy.packing import pack
 from delayrl.play.policy import Policy
 from delayrl.report.markdown import markdown_table
 from delayrl.run.provenance import versions
@@ -39,7 +40,7 @@ def build(folder: Path, name: str, delay: int) -> Path:
     """Write a bundle with untrained weights and return its folder."""
     agent, spec = AGENTS[name].presets["paper"].agent, Spec(*SIZES, delay)
     policy = Policy(agent, agent.init(spec, jax.random.key(0)), spec, -np.ones(SIZES[1]), np.ones(SIZES[1]))
-    write_files(out := folder / f"{name}-{delay}", bundle_files(policy, {"agent": name, "dt": DT}))
+    write_files(out := folder / f"{name}-{delay}", pack(*network_of(policy), {"agent": name, "dt": DT}))
     return out
 
 

@@ -12,8 +12,9 @@ from delayrl.agents.base import Agent, template
 from delayrl.agents.normalised import Moments, NormalisedObservations
 from delayrl.agents.registry import AGENTS as REGISTRY
 from delayrl.core.types import Spec
-from delayrl.deploy.export import bundle_files
+from delayrl.deploy.export import network_of
 from delayrl.deploy.files import write_files
+from delayrl.deploy.packing import pack
 from delayrl.play.policy import Policy
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.configuration import values_of
@@ -54,7 +55,7 @@ def policy_of(name: str, seed: int = 0) -> Policy:
 
 def bundle_of(path: Path, policy: Policy, **metadata: Any) -> Path:
     described = {"agent": "some", "env": "Reacher-v5", "delay": policy.spec.delay, "dt": 0.02, **metadata}
-    write_files(path, bundle_files(policy, described))
+    write_files(path, pack(*network_of(policy), described))
     return path
 
 

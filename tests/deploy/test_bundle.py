@@ -21,8 +21,9 @@ from delayrl import deploy
 from delayrl.cli.main import main
 from delayrl.deploy import Bundle, load_bundle
 from delayrl.deploy.backends.network import parse
-from delayrl.deploy.export import bundle_files
+from delayrl.deploy.export import network_of
 from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, read_files, seal, write_files
+from delayrl.deploy.packing import pack
 from delayrl.errors import DelayRLError
 
 
@@ -374,7 +375,7 @@ def test_a_bundle_that_could_not_be_read_is_not_written(bundle: Path) -> None:
     before = {file.name: file.read_bytes() for file in bundle.iterdir()}
     words = r"^bundle.json would have 1,0\d\d,\d{3} bytes, a bundle allows 1,048,576: use .*$"
     with pytest.raises(DelayRLError, match=words):
-        write_files(bundle, bundle_files(policy_of("bpql"), {"hyperparameters": "x" * (1 << 20)}), force=True)
+        write_files(bundle, pack(*network_of(policy_of("bpql")), {"hyperparameters": "x" * (1 << 20)}), force=True)
     assert {file.name: file.read_bytes() for file in bundle.iterdir()} == before
 
 

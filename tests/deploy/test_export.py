@@ -3,6 +3,7 @@
 import json
 import sys
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from bundles import bundle_of, policy_of, run_of
 
 from delayrl import DelayWarning, evaluate, load, make
+from delayrl.agents.sac import SAC
 from delayrl.cli.main import main
 from delayrl.deploy import Controller, export_run, load_bundle
 from delayrl.deploy.latency import ages_of, latency
@@ -295,3 +297,22 @@ def test_latency_refuses(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         (["--backend", "torch"], "invalid choice"),
     ):
         assert message in refused(capsys, "latency", str(out), *options)
+
+
+@dataclass(frozen=True)
+class Gentle(SAC):
+    """Acts half as strongly as its network says."""
+
+    def act(self, state, seen, key, *, explore):
+        return 0.5 * super().act(state, seen, key, explore=explore)
+
+
+def test_a_network_that_does_not_give_the_agents_actions_is_not_written(tmp_path: Path) -> None:
+    source = run_of(tmp_path / "run", "bpql").path
+    gentle = Gentle(actor_sees="augmented", critic_sees="current")
+    with pytest.raises(
+        DelayRLError, match=r"`deterministic` does not give .* its `act`: at age 0 it is 0\.\d+ of the r"
+    ):
+        export_run(source, tmp_path / "bundle", agent=gentle)
+    assert not (tmp_path / "bundle").exists()
+    export_run(source, tmp_path / "bundle", agent=SAC(actor_sees="augmented", critic_sees="current"))

@@ -27,17 +27,14 @@ from gymnasium.wrappers import (
 from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.backends.network import Network
-from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import check_target, write_files
-from delayrl.deploy.packing import pack, space_json
+from delayrl.deploy.packing import check_same, pack, space_json
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import inner_range
 from delayrl.wrappers import AugmentedObservation, Delayed
 from delayrl.wrappers.layers import layers_of, name_of
 from delayrl.wrappers.single import find_delayed
 
-SAMPLES, TOLERANCE = 200, 1e-4
-"""Inputs on which layers are compared with the policy that they are of, and their largest error, of the range."""
 HARMLESS: tuple[Any, ...] = (
     gym.Wrapper,
     gym.RewardWrapper,
@@ -161,10 +158,10 @@ def export_layers(
     half = np.asarray(policy.high, np.float64)
     if not np.allclose(policy.low, -half, rtol=1e-6):
         raise DelayRLError("a bundle takes actions with a range around 0: train with RescaleAction inside Delayed")
-    (first, bias), *rest = [(np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in layers]
+    (first, bias), *rest = _numbers(layers)
     sizes, delta = policy.obs_size, policy.max_age
     shown: Any = augmented.observation_space.shape
-    if first.ndim != 2 or len(first) != shown[0]:
+    if len(first) != shown[0]:
         raise DelayRLError(f"the first layer must take the vector of size {shown[0]}; its weights are {first.shape}")
     first = first.copy()
     first[sizes : sizes + delta * len(half)] *= np.tile(half, delta)[:, None]  # a bundle's network reads -1 .. 1
@@ -177,7 +174,8 @@ def export_layers(
     low, high = (tuple(np.asarray(bound, np.float32).tolist()) for bound in (policy.low, policy.high))
     network = Network(sizes, len(half), delta, low, high, "augmented" if delta else "observation", hidden)
     network.check(arrays)
-    _check_same(network, arrays, policy)
+    what = "with ReLU between them and a tanh at the end"
+    check_same(network, arrays, policy, f"the layers, {what}, do not compute the policy")
     metadata = {
         "agent": agent,
         "env": name_of(env),
@@ -194,18 +192,15 @@ def export_layers(
     return metadata
 
 
-def _check_same(network: Network, arrays: dict[str, Any], policy: AdaptedPolicy) -> None:
-    """Raise DelayRLError unless the network and the policy give the same actions."""
-    act, random = numpy_policy(network, arrays), np.random.default_rng(0)
-    for sample in range(SAMPLES):
-        age = sample % (policy.max_age + 1)
-        obs = (random.normal(size=policy.obs_size) * random.choice([0.1, 1.0])).astype(np.float32)
-        actions = np.zeros((policy.max_age, policy.action_size), np.float32)
-        actions[:age] = random.uniform(policy.low, policy.high, (age, policy.action_size))
-        error = float(np.max(np.abs(act(obs, actions, age) - policy(obs, actions, age)) / (policy.high - policy.low)))
-        if not error <= TOLERANCE:
-            what = "with ReLU between them and a tanh at the end"
-            raise DelayRLError(f"the layers, {what}, do not compute the policy: at age {age} it is {error:.2g} off")
+def _numbers(layers: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return weights and biases as arrays. Raises DelayRLError if they are none of a layer, or there is no layer."""
+    try:
+        pairs = [(np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in layers]
+    except (TypeError, ValueError):
+        pairs = []
+    if not pairs or any((w.ndim, b.ndim) != (2, 1) for w, b in pairs):
+        raise DelayRLError("layers are pairs of numbers: weights [inputs, outputs] and biases [outputs], first to last")
+    return pairs
 
 
 def stable_baselines_layers(model: Any) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:

@@ -4,10 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.files import check_target, write_files
-from delayrl.deploy.packing import pack, space_json
+from delayrl.deploy.packing import check_same, pack, space_json
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike, closing
 from delayrl.play.policy import Policy, restored, task_of, trained_delay
@@ -36,7 +37,8 @@ def export_run(
         agent: as `delayrl.load`.
 
     Raises:
-        DelayRLError: no run, an agent without a deterministic policy, or a folder that holds something else.
+        DelayRLError: no run, an agent without a deterministic policy or with another one than acts, or a folder that
+            holds something else.
     """
     check_target(Path(out), force=force)
     source = RunFolder(path_of(run))
@@ -44,13 +46,14 @@ def export_run(
     task = task_of(run, env)
     policy = restored(source, config, checkpoint, task, agent)
     metadata = describe(source, config, checkpoint.step, policy, task)
-    write_files(Path(out), bundle_files(policy, metadata), force=force)
+    network, arrays = network_of(policy)
+
+    def act(obs: NDArray[Any], actions: NDArray[Any], age: int) -> NDArray[np.float32]:
+        return policy.act(obs, {"age": age, "actions": actions})
+
+    check_same(network, arrays, act, f"{config['agent']}: its `deterministic` does not give the actions of its `act`")
+    write_files(Path(out), pack(network, arrays, metadata), force=force)
     return metadata
-
-
-def bundle_files(policy: Policy, metadata: dict[str, Any]) -> dict[str, bytes]:
-    """Return the files of a bundle of a policy, with a bundle.json of `metadata` and the network."""
-    return pack(*network_of(policy), metadata)
 
 
 def network_of(policy: Policy) -> tuple[Network, Arrays]:

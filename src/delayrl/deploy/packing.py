@@ -1,16 +1,39 @@
 """The content of a new bundle. Needs no JAX."""
 
 import warnings
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import safetensors.numpy
+from numpy.typing import NDArray
 
 from delayrl.deploy.backends.network import Arrays, Network
+from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.backends.onnx_policy import onnx_graph
 from delayrl.deploy.files import GRAPH, WEIGHTS, check_files, seal
-from delayrl.errors import DelayWarning
+from delayrl.errors import DelayRLError, DelayWarning
+
+SAMPLES, TOLERANCE = 200, 1e-3
+"""Inputs on which a network is compared with the policy that it is of, and its largest error, of the actions' range."""
+
+
+def check_same(network: Network, arrays: Arrays, policy: Callable[..., NDArray[Any]], otherwise: str) -> None:
+    """Raise DelayRLError, which begins with `otherwise`, unless the network gives the policy's actions at every age.
+
+    `policy` takes the newest observation [S], the actions since [Δ, A] and the age, as a bundle does.
+    """
+    act, random = numpy_policy(network, arrays), np.random.default_rng(0)
+    low, high = np.asarray(network.low), np.asarray(network.high)
+    for sample in range(SAMPLES):
+        age = sample % (network.max_age + 1)
+        obs = (random.normal(size=network.obs_size) * random.choice([0.1, 1.0])).astype(np.float32)
+        actions = np.zeros((network.max_age, network.action_size), np.float32)
+        actions[:age] = random.uniform(low, high, (age, network.action_size))
+        error = float(np.max(np.abs(act(obs, actions, age) - policy(obs, actions, age)) / (high - low)))
+        if not error <= TOLERANCE:
+            raise DelayRLError(f"{otherwise}: at age {age} it is {error:.2g} of the range off")
 
 
 def pack(network: Network, arrays: Arrays, metadata: dict[str, Any]) -> dict[str, bytes]:
