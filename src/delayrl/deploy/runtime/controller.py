@@ -208,7 +208,8 @@ class Controller:
                 if age > limit:
                     self._telemetry.counts["overruns"] += 1
                     if self.on_overrun == "raise":
-                        raise OverrunError(f"the policy takes ages 0..{limit}; the newest is {age} steps old")
+                        self._telemetry.asked(shown)
+                        raise OverrunError(f"the policy takes ages up to {limit}; the newest is {age} steps old")
             if age <= limit or (self.on_overrun == "clip" and len(shown.actions) == age):
                 action = _decide(policy, shown.obs, shown.actions, min(age, limit))
             else:

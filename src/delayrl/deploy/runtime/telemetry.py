@@ -14,12 +14,13 @@ class Statistics:
     `age_*` and `delay_*` are those of the newest observation that had arrived at a decision, held back or not. Like
     `period_*` they leave out the cold start of an episode: they begin with the first decision whose newest observation
     was made after the first command. Before, the age only shows how long the episode has run. Decisions that
-    `on_overrun="raise"` refuses appear in `overruns` only. The means and deviations are NaN while nothing has been
-    counted (`age_min` and `age_max` are 0), and `delay_*` and `period_*` are NaN with stamps in steps.
+    `on_overrun="raise"` refuses are among `overruns`, `age_*` and `delay_*`, and not among `decisions`. The means and
+    deviations are NaN while nothing has been counted (`age_min` and `age_max` are 0), and `delay_*` and `period_*` are
+    NaN with stamps in steps.
     """
 
     decisions: int  # actions chosen by `act`
-    counted: int  # decisions after the cold start
+    counted: int  # decisions after the cold start, with refused ones
     age_mean: float  # steps, with actions in flight: the effective delay
     age_std: float  # steps: the jitter
     age_min: int
@@ -69,10 +70,8 @@ class Telemetry:
         self._ages, self._delays, self._periods = Moments(), Moments(), Moments()
         self._age_min = self._age_max = 0
 
-    def decided(self, shown: Shown, period: float) -> None:
-        """Count a decision on what was shown, `period` after the last command."""
-        self.counts["decisions"] += 1
-        self.counts["held"] += shown.age > shown.newest_age
+    def asked(self, shown: Shown) -> None:
+        """Count the age and the delay of the newest observation at a decision, which may be refused."""
         if not shown.warm:
             return
         self._age_min = min(self._age_min, shown.newest_age) if self._ages.count else shown.newest_age
@@ -80,6 +79,13 @@ class Telemetry:
         self._ages.add(shown.newest_age)
         if self._stamps == "seconds":
             self._delays.add(shown.newest_delay)
+
+    def decided(self, shown: Shown, period: float) -> None:
+        """Count a decision on what was shown, `period` after the last command."""
+        self.counts["decisions"] += 1
+        self.counts["held"] += shown.age > shown.newest_age
+        self.asked(shown)
+        if shown.warm and self._stamps == "seconds":
             self._periods.add(period)
 
     def snapshot(self) -> Statistics:
