@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -409,6 +410,16 @@ def test_irregular_rows(tmp_path: Path) -> None:
     assert e.rows < 3000
 
 
+def test_parts_that_differ_by_a_row_do_not_vary(tmp_path: Path) -> None:
+    """A dead time is known to a row, so such parts are those of a constant delay."""
+    e = from_log(log(tmp_path / "log.csv", *signals("servo", 3, 4000)), 2 * ROW)
+    parts = tuple((float(n), delay * ROW) for n, delay in enumerate((3, 4, 4, 4, 3)))
+    alike = replace(e, windows=parts, span=(3 * ROW, 5 * ROW), step_span=(1, 2), steps=(1, 2, 2, 2, 1))
+    assert (alike.train_with, alike.in_step) == ("episode:1:3", "episode:1:2")
+    apart = replace(alike, span=(3 * ROW, 6 * ROW), step_span=(2, 3))
+    assert (apart.train_with, apart.in_step) == ("uniform:1:4", "uniform:2:3")
+
+
 def test_columns_units_and_recordings(tmp_path: Path) -> None:
     u, y = signals("servo", 3, 1200)
     clock = np.tile(1000 * ROW * np.arange(400), 3)  # three recordings, in ms
@@ -417,7 +428,7 @@ def test_columns_units_and_recordings(tmp_path: Path) -> None:
     )
     words = {"time": "clock", "commands": ["wish"], "observations": ["angle"]}
     e = from_log(path, episode="part", unit="ms", **words)
-    line = r"lie 20 s apart: if its time stamps are in milliseconds, say so \(--unit ms\)"
+    line = r"lie 20 s apart: if its time stamps are not in seconds, say so \(--unit ms\)"
     with pytest.warns(DelayWarning, match=line):
         from_log(path, episode="part", **words)
     assert (e.row, e.delay) == (pytest.approx(ROW), pytest.approx(3 * ROW))

@@ -20,7 +20,6 @@ RESAMPLINGS = 200
 LEAST_ROWS = 200
 WINDOW_ROWS = 400  # least rows of a part of the log with its own estimate
 WINDOWS = 8
-SLOW = 2.0  # seconds between rows, beyond which the unit is doubtful
 WARM_UP = 0.05  # of the log, the part that is left out at its start by default
 
 
@@ -76,24 +75,27 @@ class Estimated:
         10th to the 90th percentile of windows that differ, for a sensor with the period of the loop. The law is of each
         episode, or of each message if ages vary within one.
         """
-        stamped, (low, high) = self.method == "stamps", np.array(self.span) / self.period
-        youngest, oldest = any_phase(low, high, 0.0 if stamped else 1.0)  # the ages of stamps include the period
-        if youngest == oldest:
-            return str(oldest)
-        law = uniform(youngest, oldest)
-        steady = min(self.row / self.period, 1.0)  # by how much ages differ at the phases of a sensor, but not in one
-        varies = high - low > steady + TOLERANCE if stamped else len(self.counts) > 1
-        return str(law if varies else PerEpisode(law))
+        (low, high), period = np.array(self.span) / self.period, float(self.method != "stamps")  # theirs includes it
+        return self._law(*any_phase(low, high, period), self._varies)
 
     @property
     def in_step(self) -> str:
-        """The argument for a sensor in step with the control loop: the steps, or `uniform:LOW:HIGH` if they vary.
+        """The argument for a sensor in step with the control loop: the steps, or a law if they differ, as `train_with`.
 
         With stamps, LOW is the smallest delay, and HIGH the 99th percentile of the ages before the next observation
         arrives. With windows, they are the 10th and 90th, because a window is short and its estimate is rough.
         """
-        low, high = self.step_span
-        return str(high) if low == high else f"uniform:{low}:{high}"
+        return self._law(*self.step_span, self.method == "stamps" or self._varies)
+
+    def _law(self, low: int, high: int, varies: bool) -> str:
+        return str(high if low == high else uniform(low, high) if varies else PerEpisode(uniform(low, high)))
+
+    @property
+    def _varies(self) -> bool:
+        """Whether ages vary within an episode: by more than a sensor's phase or an estimate's scatter explains."""
+        # by correlation the span has a row more, and a part is known to a row
+        alike = min(self.row, self.period) if self.method == "stamps" else 2 * self.row
+        return self.span[1] - self.span[0] > alike + TOLERANCE * self.period
 
     @property
     def counts(self) -> dict[int, int]:
@@ -153,8 +155,7 @@ def from_log(
     Raises:
         DelayRLError: the log cannot be used, or shows no delay beyond chance.
     """
-    path = Path(path)
-    given, unit = unit, "s" if unit is None else unit
+    path, given, unit = Path(path), unit, "s" if unit is None else unit
     if unit not in reading.UNITS:
         raise DelayRLError(f"time stamps are in {', '.join(reading.UNITS)}; got {unit!r}")
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
@@ -168,9 +169,9 @@ def from_log(
         log, row = reading.resample(reading.read_signals(table, time, commands, observations, episode, unit))
         warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
         estimated = _correlated(path, log, row, period or row, longest, warm, seed)
-    if estimated.row > SLOW and given is None:
-        line = f"the rows of {path} lie {estimated.row:.3g} s apart: if its time stamps are in milliseconds, say so"
-        warnings.warn(f"{line} (--unit ms)", DelayWarning, stacklevel=2)
+    if estimated.row > reading.SLOW and given is None:
+        line = f"the rows of {path} lie {estimated.row:.3g} s apart: if its time stamps are not in seconds, say so"
+        warnings.warn(f"{line} (--unit {reading.likely_unit(estimated.row)})", DelayWarning, stacklevel=2)
     return estimated
 
 

@@ -15,6 +15,7 @@ from delayrl.measure.correlate import Array
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PREFIXES = {"commands": ("command", "cmd", "action"), "observations": ("observation", "obs")}
 GAP = 20  # rows that may be missing within one recording
+SLOW = 2.0  # seconds between rows, beyond which the unit is doubtful
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,11 @@ def read_stamps(
             raise DelayRLError(f"{table.path}: stamps need both times; it has no column for {other}")
         return None
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit], table.recordings(episode)
+
+
+def likely_unit(row: float) -> str:
+    """Return the unit that time stamps may have where rows seem to lie so many seconds apart."""
+    return next((name for name in ("ms", "us") if row * UNITS[name] <= SLOW), "ns")
 
 
 def resample(log: Log) -> tuple[Log, float]:
@@ -163,7 +169,8 @@ class Table:
         except (TypeError, ValueError):
             row = next((i for i, cell in enumerate(cells) if not _number(cell)), 0)
             shown = "an empty cell" if cells[row] in ("", None) else f"{cells[row]!r}, which is not a number"
-            raise DelayRLError(f"{self.path}, row {row + 1}: column {name} has {shown}") from None
+            where = f"{self.path}, row {row + 1}"
+            raise DelayRLError(f"{where}: column {name} has {shown}; drop such rows or fill them") from None
         values = values.reshape(len(values), -1)
         invalid = ~np.isfinite(values).all(1)
         if invalid.any():
