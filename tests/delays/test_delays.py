@@ -122,6 +122,7 @@ def test_of_each_episode() -> None:
         ("episode:walk:3", random_walk(3), "episode:walk:3"),
         ("episode:recorded:3,1,", Recorded((3, 1)), "episode:recorded:3,1,"),
         ("episode:3", Constant(3), "episode:3"),
+        ("episode:1e1:20", uniform(10, 20), "episode:10:20"),
     ],
 )
 def test_texts_of_episodes(text: str, law: DelayLaw, written: str) -> None:
@@ -231,6 +232,7 @@ def test_a_delay_in_the_other_unit(value: DelayLike, step: float, words: str) ->
         *(("0", 0), ("4", 4), ("uniform:2:4", 2), ("uniform:2:4@wait", 4), ("uniform:2:4@raw", 2), ("poisson:2:5", 0)),
         *(("gilbert:3:1:0.2:0.4", 1), ("walk:8", 0), ("recorded:4,2,6,", 2), ("paper-stochastic-5", 1)),
         *(("gamma:20:2:30", 15), ("choice:0=0,5=1", 5), ("walk:3:0.5+action=2", 2)),
+        *(("uniform:0:1999", 1), ("1+action=uniform:1:3@wait", 4)),
         *(("episode:2:4", 2), ("80~15", 80), ("2+action=3+reward=1", 5), ("uniform:1:3+action=episode:2:4", 3)),
     ],
 )
@@ -440,3 +442,8 @@ def test_laws_take_arrays() -> None:
     for empty in (lambda: Choice((), ()), lambda: Recorded(())):
         with pytest.raises(DelayRLError, match="at least one"):
             empty()
+
+
+def test_ages_count_the_longest_delay_of_an_action_that_varies_within_an_episode() -> None:
+    assert as_delay("1+action=uniform:1:3").minimum == 4
+    assert as_delay("1+action=episode:1:3").minimum == 2

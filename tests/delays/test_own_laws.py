@@ -182,3 +182,26 @@ def test_code_that_came_with_a_run_is_not_imported(tmp_path: Path, monkeypatch) 
     assert not witness.exists()
     assert delayrl.make(make_arm, "runs.evil:Burst").delay.maximum == 3  # whoever names it means it
     assert witness.exists()
+
+
+@dataclass(frozen=True)
+class UDP:
+    """Its name is in capitals, and it forgets that draw returns a state."""
+
+    maximum: int = 3
+
+    def draw(self, state: int, random: np.random.Generator) -> Any:
+        return 3
+
+
+def test_a_draw_without_a_state() -> None:
+    with pytest.raises(DelayRLError, match="drew 3, not a travel time and the next state"):
+        drawn(as_delay(UDP()).observation.law, 1)
+
+
+def test_a_name_in_capitals_may_be_of_an_episode(tmp_path: Path) -> None:
+    """A run keeps such texts: they are no two numbers."""
+    text = str(as_delay(PerEpisode(UDP())))  # type: ignore[arg-type]
+    assert text.startswith("episode:")
+    for kept in (text, "episode:<UDP:3>"):
+        assert str(stored_delay(kept, tmp_path)) == kept

@@ -3,6 +3,7 @@
 import hashlib
 import re
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Literal, get_args
 
 from delayrl.delays import laws
@@ -95,8 +96,8 @@ class Delay:
 
     @property
     def minimum(self) -> int:
-        """The least age of observations: of their and the actions' shortest delays."""
-        return self.observation.minimum + self.action.minimum
+        """The least age of observations, which counts the longest delay that actions have in an episode."""
+        return self.observation.minimum + (self.action.minimum if self.action.steady else self.action.maximum)
 
     @property
     def latest(self) -> int:
@@ -160,7 +161,8 @@ def _shortest(law: DelayLaw) -> int:
             return law.steps
         case laws.Choice() | laws.Markov():
             shares = law.probabilities if isinstance(law, laws.Choice) else law.stationary
-            return min(steps for steps, share in zip(law.steps, shares, strict=True) if share >= RARE)
+            steps, each = zip(*sorted(zip(law.steps, shares, strict=True)), strict=True)
+            return next(n for n, share in zip(steps, accumulate(each), strict=True) if share >= RARE)
         case laws.Recorded():
             return min(law.steps)
         case PerEpisode():

@@ -59,8 +59,10 @@ class OwnLaw:
         """Draw from the user's law. Raises DelayRLError for a travel time that is not in 0..maximum, or no law."""
         if self.law is None:
             raise DelayRLError(f"{self.text} has no name that it could be imported by: give it again, as delay")
-        travel, state = self.law.draw(state, random)
-        travel = whole_steps(travel) + self.later
+        drawn: Any = self.law.draw(state, random)
+        if not isinstance(drawn, tuple) or len(drawn) != 2:
+            raise DelayRLError(f"{self.text} drew {drawn!r:.80}, not a travel time and the next state: {PAGE}")
+        travel, state = whole_steps(drawn[0]) + self.later, drawn[1]
         if travel > self.maximum:
             longest = self.maximum - self.later
             raise DelayRLError(f"{self.text} drew {travel - self.later} steps, and its maximum is {longest}")

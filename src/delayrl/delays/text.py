@@ -157,7 +157,7 @@ class DelayParser:
                 rows = tuple(tuple(map(self.probability, row.split(","))) for row in table.split("/"))
                 return laws.Markov(tuple(map(self.steps, states.split(","))), rows)
             case "episode":  # with two numbers, of a uniform law
-                return PerEpisode(self.law(f"uniform:{rest}" if re.match(r"[^:a-z]+(s|ms)?:", rest) else rest))
+                return PerEpisode(self.law(f"uniform:{rest}" if re.match(r"[\d.+-][^:]*:", rest) else rest))
             case "recorded" if re.fullmatch(r"(\d{1,9},)+(\d{1,9})?", rest):
                 return laws.Recorded(tuple(int(word) for word in rest.split(",") if word))
             case "recorded" if self._folder is None:  # a run folder holds the numbers, and may come from elsewhere
