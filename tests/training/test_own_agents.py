@@ -2,6 +2,7 @@
 
 import json
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from delayrl.bench.grid import load_grid
 from delayrl.cli.main import main
 from delayrl.core.types import Spec
 from delayrl.deploy import export_run, load_bundle
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.play.run import Run
 from delayrl.play.video import watch
@@ -68,6 +69,22 @@ def test_a_run_names_its_agent(tmp_path: Path) -> None:
     policy = delayrl.load(run.path)
     assert policy.agent == Shrink(width=4)
     assert len(evaluate(run.path, 2)["returns"]) == 2
+
+
+def test_code_that_has_changed_is_told(tmp_path: Path, monkeypatch) -> None:
+    """An agent's file is edited after a run: nothing of the run's configuration shows it."""
+    text = Path(own_agents.__file__).read_text()
+    write_module(tmp_path, "edited", text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = train("edited:Shrink", tmp_path / "run")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate(run.path, 1)
+        train("edited:Shrink", tmp_path / "run")
+    write_module(tmp_path, "edited", text + "# another line\n")
+    for what in (lambda: evaluate(run.path, 1), lambda: train("edited:Shrink", tmp_path / "run")):
+        with pytest.warns(DelayWarning, match="the code of edited:Shrink has changed since .*run was trained"):
+            what()
 
 
 def test_a_run_is_played_by_the_agent_of_its_length(tmp_path: Path) -> None:
@@ -209,6 +226,8 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
         find_agent("nowhere")
     with pytest.raises(DelayRLError, match=r"^an agent is a name .*, MODULE:NAME, a class or an instance; got None$"):
         as_agent(None)  # type: ignore[arg-type]
+    with pytest.raises(DelayRLError, match=r"got Registration\(.{60,80}: name its variable, as text$"):
+        as_agent(own_agents.ENTRY)  # type: ignore[arg-type]
     (tmp_path / "shrink").mkdir()
     (tmp_path / "runs").mkdir()
     monkeypatch.chdir(tmp_path)

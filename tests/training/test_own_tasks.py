@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import NormalizeReward
 from PIL import Image
 
 import delayrl
@@ -69,6 +70,20 @@ def test_a_task_that_ignores_its_seed_is_named_at_the_start(tmp_path: Path) -> N
     line = "Unseeded does not begin an episode twice in the same way from one seed .* cannot go on after a stop"
     with pytest.warns(delayrl.DelayWarning, match=line):
         train("random", tmp_path / "run", env=Unseeded, wrappers=[LIMIT])
+
+
+class Shaky(Arm):
+    """An arm whose steps draw from NumPy's global generator."""
+
+    def step(self, action: Any) -> Any:
+        return super().step(action + np.random.uniform(-0.1, 0.1, 1))  # noqa: NPY002
+
+
+@pytest.mark.parametrize(("env", "wrappers"), [(Shaky, [LIMIT]), (Arm, [NormalizeReward, LIMIT])])
+def test_steps_and_rewards_that_are_not_repeated_are_named_too(env: Any, wrappers: list, tmp_path: Path) -> None:
+    """A resumed run would silently be another one where rewards alone differ."""
+    with pytest.warns(delayrl.DelayWarning, match="does not begin an episode twice in the same way from one seed"):
+        train("random", tmp_path / "run", env=env, wrappers=wrappers)
 
 
 def test_environments_are_closed(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from delayrl.delays import Delay, stored_delay
 from delayrl.envs.making import make
 from delayrl.envs.task import Task, TaskLike, closing, stored_task
 from delayrl.errors import DelayRLError
-from delayrl.run.agents import AgentLike, agent_of
+from delayrl.run.agents import AgentLike, agent_of, warn_of_other_code
 from delayrl.run.arrays import inner_range, restore_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder, RunLike, path_of
@@ -132,6 +132,8 @@ def restored(
 ) -> Policy:
     """Load the policy in a checkpoint of a run with this configuration, whose task is looked up; `given` as `load`."""
     agent = agent_of(config, run.path, given)
+    if given is None:
+        warn_of_other_code(config, run.path, agent)
     with closing(make(task, stored_delay(config["delay"], run.path))) as env:
         spec, actions = spec_of(env), env.action_space
     try:

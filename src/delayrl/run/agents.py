@@ -6,7 +6,10 @@ run keeps the name beside the hyperparameters; what no name leads back to, such 
 """
 
 import difflib
+import hashlib
 import inspect
+import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -15,9 +18,10 @@ from typing import Any, NamedTuple
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import AGENTS, Registration, registered
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.lookup import entry_points, find_object, is_unsafe, name_of_object, one_line, public_name
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
+from delayrl.run.folder import versions_in
 
 GROUP = "delayrl.agents"
 AgentLike = str | Agent | type[Agent]
@@ -39,7 +43,9 @@ def as_agent(agent: AgentLike) -> Named:
         name = public_name(agent, GROUP) if ":" in agent else agent
         return Named(name, find_agent(name))
     if not isinstance(agent, type) and not is_dataclass(agent):
-        raise DelayRLError(f"an agent is a name (`delayrl agents`), MODULE:NAME, a class or an instance; got {agent!r}")
+        line = "an agent is a name (`delayrl agents`), MODULE:NAME, a class or an instance"
+        hint = ": name its variable, as text" if isinstance(agent, Registration) else ""
+        raise DelayRLError(f"{line}; got {agent!r:.80}{hint}")
     kind = agent if isinstance(agent, type) else type(agent)
     name, made = name_of_object(kind), _checked(agent, kind.__name__)
     if not name.startswith("<") and not _is_made_of(name, made):
@@ -104,6 +110,31 @@ def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = 
     check_names(config["hyperparameters"], agent)
     agent = override(agent, {**(OLDER if config["agent"] in AGENTS else {}), **config["hyperparameters"]})
     return as_trained(agent, override(preset.schedule, {**OLDER, **config["schedule"]}))
+
+
+def code_of(name: str, agent: Agent) -> str | None:
+    """Return a checksum of the modules that name and class of an agent lead to; None for those of this package.
+
+    What those modules import is not in it.
+    """
+    source = name if ":" in name else entry_points(GROUP).get(name, "")
+    own = agent.agent if isinstance(agent, NormalisedObservations) else agent
+    names = {source.partition(":")[0], type(own).__module__} - {""}
+    files = [getattr(sys.modules.get(module), "__file__", None) for module in sorted(names) if not _is_ours(module)]
+    contents = [Path(file).read_bytes() for file in files if file and Path(file).is_file()]
+    return hashlib.sha256(b"".join(contents)).hexdigest()[:12] if contents else None
+
+
+def warn_of_other_code(config: Mapping[str, Any], folder: Path, agent: Agent) -> None:
+    """Warn if the modules of an agent differ from those that a run was last trained with."""
+    known = [used["agent_code"] for used in versions_in(config) if used.get("agent_code")]
+    if known and code_of(config["agent"], agent) not in (None, known[-1]):
+        line = f"the code of {config['agent']} has changed since {folder} was trained"
+        warnings.warn(line, DelayWarning, stacklevel=3)
+
+
+def _is_ours(module: str) -> bool:
+    return module.partition(".")[0] == "delayrl"
 
 
 def as_trained(agent: Agent, schedule: Schedule) -> Agent:

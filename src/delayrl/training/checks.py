@@ -3,9 +3,11 @@
 import warnings
 from importlib.util import find_spec
 from numbers import Integral
+from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
 from delayrl.agents.base import State, template
 from delayrl.core import replay as ring
@@ -79,8 +81,21 @@ def check_fit(setup: Setup, env: Delayed) -> State:
 def check_repeats(setup: Setup) -> None:
     """Warn if an environment does not begin twice in the same way from one seed. It is made for that, and closed."""
     with closing(make(setup.task, setup.delay.observed(), rescale=True)) as env:
-        first, again = (stepping.reset(env, 0)[1]["truth"] for _ in range(2))
-    if not np.array_equal(first, again):
-        why = "its reset has to call super().reset(seed=seed), and its wrappers to keep nothing over a reset"
+        first, again = (_beginning(env) for _ in range(2))
+    if not np.array_equal(first, again, equal_nan=True):
+        why = "its reset has to call super().reset(seed=seed), its steps to draw from self.np_random alone, and its "
+        why += "wrappers to keep nothing over a reset"
         line = f"{name_of(env)} does not begin an episode twice in the same way from one seed ({why})"
         warnings.warn(f"{line}: a run on it cannot go on after a stop", DelayWarning, stacklevel=4)
+
+
+def _beginning(env: Delayed) -> NDArray[Any]:
+    """Return the observations and rewards of the first three steps from seed 0, in a row."""
+    numbers = [np.ravel(stepping.reset(env, 0)[1]["truth"])]
+    for _ in range(3):
+        action = np.full(env.action_space.shape or (), 0.1, np.float32)
+        _, reward, terminated, truncated, info = stepping.step(env, action)
+        numbers += [np.ravel(info["truth"]), np.ravel(reward)]
+        if terminated or truncated:
+            break
+    return np.concatenate(numbers)

@@ -14,6 +14,7 @@ from delayrl.agents.base import Schedule
 from delayrl.core import replay as ring
 from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
+from delayrl.run.agents import code_of, warn_of_other_code
 from delayrl.run.arrays import Arrays, flatten_tree, load_arrays, restore_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.configuration import OLDER, values_of
@@ -48,6 +49,8 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     state = restore(group, actors, checkpoints) if checkpoints else _fresh(group, actors, note)
     config |= {"configuration": group.setup.configuration}
     used = versions()
+    if code := code_of(config["agent"], group.setup.agent):
+        used["agent_code"] = code
     new = [run for run in runs if run in replaced or not run.exists]
     longer = [run for run in runs if run not in new and run.config["schedule"]["steps"] != group.setup.schedule.steps]
     if new or longer:
@@ -67,6 +70,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     newest = checkpoints[0]
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
+    warn_of_other_code(runs[0].config, runs[0].path, group.setup.agent)
     for run, checkpoint in zip(runs, checkpoints, strict=True):
         if run in longer:
             run.extend(run.config | config)
@@ -162,7 +166,7 @@ def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) ->
             columns[name][i] = loop[name]
         actor = actors[i]
         actor.replay_episode(int(loop["episode"]), loop["actions"])
-        if not np.array_equal(actor.truth, loop["truth"]):
+        if not np.array_equal(actor.truth, loop["truth"]) or actor.total != loop.get("total", actor.total):
             env = group.setup.condition.env
             raise DelayRLError(f"{env} does not repeat an episode from its seed, so the run cannot be resumed")
     replay = ring.Replay(**{name: jnp.asarray(columns.pop(name)) for name in ring.Replay._fields})
@@ -236,7 +240,7 @@ def _loop_arrays(group: Group, state: TrainState, seed: int) -> Arrays:
     counts = {name: int(getattr(replay, name)[seed]) for name in COUNTS} | {"episode": actor.episode}
     arrays |= {name: np.asarray(count, np.int32) for name, count in counts.items()}
     actions = np.reshape(actor.actions, (-1, group.spec.action_size))
-    return arrays | {"truth": actor.truth, "actions": actions}
+    return arrays | {"truth": actor.truth, "actions": actions, "total": np.asarray(actor.total, np.float64)}
 
 
 def _cut(replay: ring.Replay, seed: int, first: int, last: int, first_step: int, steps: int) -> Arrays:
