@@ -9,12 +9,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
+from gymnasium.spaces import Box
 from gymnasium.wrappers import NormalizeObservation, TimeLimit
 
 import delayrl
 import own_tasks
-from delayrl.envs.making import delay_of
-from delayrl.envs.task import Part, Task, as_task, stored_task
+from delayrl.envs.making import delay_of, make
+from delayrl.envs.task import Part, Task, as_task, closing, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import resolve
 from delayrl.wrappers.layers import limit_of
@@ -361,3 +362,19 @@ def test_safe_path_is_respected(tmp_path: Path) -> None:
             "import sys; sys.path[:] = [p for p in sys.path if p]\n" + code,
         ]
         assert words in subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
+
+
+def test_rounding_brings_no_action_beyond_its_range() -> None:
+    """In single precision 0.1 + (0.3 - 0.1) is above 0.3."""
+
+    class Valve(Arm):
+        action_space = Box(0.1, 0.3, (1,), np.float32)
+
+        def step(self, action: np.ndarray) -> Any:
+            assert self.action_space.contains(action), action
+            return super().step(action)
+
+    with closing(make(Valve, 0, wrappers=[LIMIT], rescale=True)) as env:
+        env.reset(seed=0)
+        for action in np.linspace(-1, 1, 9, dtype=np.float32):
+            env.step(np.full(1, action))

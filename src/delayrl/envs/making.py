@@ -69,6 +69,8 @@ def make(
         low, high = task.action_space.low, task.action_space.high
         idle = 2 * (np.clip(0, low, high) - low) / (high - low) - 1
         task = RescaleAction(task, np.float32(-1), np.float32(1))
+        rescaled = task.func
+        task.func = lambda action: np.clip(rescaled(action), low, high)  # rounding may have brought it beyond
     return Delayed(task, delay, history, fill, idle, step_seconds)
 
 
