@@ -116,6 +116,26 @@ def test_overrides_of_all_of_a_product_and_of_an_agent(tmp_path: Path) -> None:
     assert cells["vdpo", 3].steps == 6000
 
 
+def test_a_products_own_value_wins_over_the_shared_one_of_an_agent(tmp_path: Path) -> None:
+    text = """
+    preset = "small"
+    tasks = ["Reacher-v5"]
+    delays = [2]
+    [overrides.vdpo]
+    batch_size = 64
+    width = 8
+    [[product]]
+    agents = ["bpql", "vdpo"]
+    [product.overrides]
+    batch_size = 32
+    """
+    conditions = [cell.condition for cell in load_grid(write(tmp_path, text)).cells]
+    assert {c.agent: c.overrides for c in conditions} == {
+        "bpql": {"batch_size": 32},
+        "vdpo": {"batch_size": 32, "width": 8},
+    }
+
+
 def test_overrides_of_all_agents_skip_those_without_the_option(tmp_path: Path) -> None:
     """Of the whole grid, and of one product; each name needs one agent that has it."""
     text = """

@@ -260,6 +260,19 @@ def test_an_episode_twice(finished, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_that_went_on_is_not_of_its_cell(finished, tmp_path: Path) -> None:
+    grid, runs = finished
+    cell = replace(grid.cells[0], id="6789")
+    run, source = (RunFolder(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
+    run.create({k: v for k, v in source.config.items() if k != "format"})
+    run.append("rows", [row | {"step": row["step"] + cell.condition.steps} for row in source.read("rows")])
+    alone = Grid("alone", "", Path("alone.toml"), (cell,))
+    for what in (lambda: collect(alone, runs, tmp_path / "t.sqlite"), lambda: list(rows_of([cell], runs))):
+        with pytest.raises(delayrl.DelayRLError, match=r"was trained up to step .*, and its cell ends at"):
+            what()
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("change", ["{}", "5", '"step": null', '"return": NaN', '"return": "1"'])
 def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
     """Reading and collecting fail with one line, and no table is written."""

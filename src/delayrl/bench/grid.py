@@ -151,10 +151,13 @@ def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], what: str) -
 
 
 def _merge(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge overrides; a product's own win. The tables of a single agent are merged too."""
-    merged = dict(shared)
+    """Merge overrides; a product's own win, over shared tables of agents too. Tables of the same agent are merged."""
+    merged = {
+        name: {key: x for key, x in value.items() if key not in own} if isinstance(value, dict) else value
+        for name, value in shared.items()
+    }
     for key, value in own.items():
-        known = shared.get(key, value)
+        known = merged.get(key, value)
         if isinstance(known, dict) != isinstance(value, dict):
             raise DelayRLError(f"overrides: {key} is a table in one place and a value in another")
         merged[key] = known | value if isinstance(value, dict) else value

@@ -42,8 +42,17 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
     """Yield the rows of cells, each with its cell's id, from run folders. Raises DelayRLError for a damaged row."""
     for cell in cells:
         for path in folders.seed_paths(runs / cell.folder, cell.seeds):
-            for row in name_configuration(RunFolder(path).read("rows")):
+            for row in _own_rows(cell, path):
                 yield row | {"cell": cell.id}
+
+
+def _own_rows(cell: Cell, path: Path) -> list[Row]:
+    """Return the rows of a cell's run. Raises DelayRLError if it was trained further than the cell."""
+    rows = name_configuration(RunFolder(path).read("rows"))
+    if (last := max((row["step"] for row in rows), default=0)) > cell.condition.steps:
+        line = f"{path} was trained up to step {last:,}, and its cell ends at {cell.condition.steps:,}"
+        raise DelayRLError(f"{line}: move it out of that folder, and run the cell again")
+    return rows
 
 
 class Held(NamedTuple):
@@ -124,7 +133,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
     for number, cell in enumerate(grid.cells):
         p = progress(cell, runs)  # before the rows, which may be more
         paths = zip(folders.seed_paths(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
-        found = [(path, seed, name_configuration(RunFolder(path).read("rows"))) for path, seed in paths]
+        found = [(path, seed, _own_rows(cell, path)) for path, seed in paths]
         here = Held(sum(len(rows) for *_, rows in found), p.state == "done", p.step)
         elsewhere = max(held, key=lambda file: held[file].get(cell.id, Held()), default=None)
         best = held[elsewhere].get(cell.id, Held()) if elsewhere else Held()
