@@ -158,8 +158,8 @@ def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (run.path / "delays.png").stat().st_size > 5000
     cli.main(["evaluate", str(run.path), "--sweep", "--episodes", "2"])
     titles, *_, last = capsys.readouterr().out.split("\n")[:-1]
-    assert titles.split() == ["delay", "mean", "return", "std", "lowest", "episodes"]
-    assert last.split()[3] == f"{min(results[-1]['returns']):.1f}"
+    assert titles.split() == ["delay", "learned", "mean", "return", "std", "lowest", "episodes"]
+    assert [last.split()[1], last.split()[4]] == ["yes", f"{min(results[-1]['returns']):.1f}"]
     with pytest.raises(SystemExit):
         cli.main(["evaluate", str(run.path), "--sweep", "--delay", "2"])
 

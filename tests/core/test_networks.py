@@ -251,3 +251,10 @@ def test_gradients_of_layer_norm(shape: tuple[int, ...]) -> None:
     for one, other, several in zip(expected, alone, seeds, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=2e-5)
         np.testing.assert_allclose(one, several[1], rtol=1e-4, atol=2e-5)
+
+
+def test_masks_under_another_generator_of_jax() -> None:
+    keys = [jax.random.key(seed, impl="rbg") for seed in (0, 1)]
+    first, second = (dropout_masks(key, 0.5, [(64, 8)])[0] for key in keys)
+    assert 0.3 < float(first.mean()) < 0.7
+    assert (first != second).any()

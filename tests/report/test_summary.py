@@ -334,3 +334,13 @@ def test_overrides_of_a_task_do_not_part_an_agent() -> None:
     assert "Overridden in all cells of bpql, vdpo on Hopper-v4: steps=200." in markdown(summary, "t", {})
     (met,) = [c for c in summary.comparisons if (c.one, c.other) == ("bpql", "vdpo")]
     assert met.tasks == 2
+
+
+def test_a_threshold_that_random_reaches_is_none() -> None:
+    """Smoothing over a fast ascent brings the reference below `random`, which would reach it at its first step."""
+    cells = small()
+    rows = [row for row in anchored(cells, vdpo=[[0.0, 1, 2], [0.0, 1, 4]]) if row["agent"] != "sac"]
+    rows += [row for seed in range(2) for row in curve(cells["sac"], seed, [-900.0, -900, 100])]
+    result = of(summarise(rows, [*cells.values()]), "vdpo")
+    assert (result.reference_anchor.value, result.random_anchor.value) == (100, 10)
+    assert np.isnan([result.threshold, result.steps_to_threshold, *result.steps_interval]).all()

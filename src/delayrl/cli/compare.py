@@ -36,7 +36,7 @@ def run(given: argparse.Namespace) -> None:
         if apart := differences([one.config for one in group]):
             names = ", ".join(name for name, *_ in apart)
             raise DelayRLError(f"the seeds in {path} differ in {names}; name runs alone")
-    configs = [group[0].config for group in groups]
+    configs = [group[0].config | {"delay": group[0].delay} for group in groups]
     labels = LABELS[: len(groups)]
     for label, path, group in zip(labels, given.runs, groups, strict=True):
         print(f"{label}  {path}" + (f" ({len(group)} seeds)" if len(group) > 1 else ""))

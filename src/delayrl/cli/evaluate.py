@@ -60,8 +60,9 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
         rows = []
         for r in results:
             values = (r["mean_return"], r["std_return"], min(r["returns"]))
-            rows.append([r["delay"], *("" if value is None else f"{value:.1f}" for value in values), r["episodes"]])
-        print_table(["delay", "mean return", "std", "lowest", "episodes"], rows)
+            numbers = ("" if value is None else f"{value:.1f}" for value in values)
+            rows.append([r["delay"], "yes" if r["learned"] else "no", *numbers, r["episodes"]])
+        print_table(["delay", "learned", "mean return", "std", "lowest", "episodes"], rows)
     _say_unfinished(given.run, results[0]["step"])
     figure = given.run / "delays.png"
     against_delay(results, figure)

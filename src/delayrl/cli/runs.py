@@ -41,7 +41,7 @@ def _row(run: Run) -> dict[str, Any]:
     evaluated = max(curve.steps, default=0)
     step = max([int(evaluated), *(int(folder.name) for folder in checkpoint_folders(run.path))])
     last = float(curve.returns[-1].mean()) if evaluated else None
-    columns = {name: config.get(name) for name in NAMES}
+    columns = {name: config.get(name) for name in NAMES} | {"delay": run.delay}
     return row | columns | {"step": step, "steps": config["schedule"].get("steps", 0), "return": last}
 
 

@@ -113,7 +113,8 @@ def run(given: argparse.Namespace) -> None:
 def _print_summary(run: Run) -> None:
     """Print the last returns of a run, its folder, and what to type next."""
     config, last = run.config, max(run.curve().steps, default=0)
-    print(f"{config['agent']} on {config['env']}, delay {config['delay']}, seed {config['seed']}: {last:,} steps")
+    about = f"{config['agent']} on {config['env']}, delay {run.delay}, seed {config['seed']}"
+    print(f"{about}: {last:,} steps")
     label = "return under delay" if config["delay"] != 0 else "return"
     for policy, text in (("agent", label), ("reference", "its reference, no delay")):
         steps, returns = run.curve(policy)

@@ -22,7 +22,7 @@ def threefry(key: Key, count: int) -> UInt32[Array, "2 count"]:
 
     JAX's implementation runs on one core, as a loop over the rounds that writes all words to memory in each round.
     """
-    first, second = jax.random.key_data(key)
+    first, second = jax.random.key_data(key)[:2]
     keys = (first, second, first ^ second ^ jnp.uint32(0x1BD11BDA))
     counter = jnp.arange(count, dtype=jnp.uint32)
     x, y = counter + first, counter + jnp.uint32(count) + second

@@ -220,11 +220,15 @@ def sweep(
     env_kwargs: Mapping[str, Any] | None = None,
     agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for."""
+    """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for.
+
+    Yields what `evaluate` returns, and `learned`: whether the policy learned that age, after the start of an episode.
+    """
     name, task = RunFolder(path_of(run)).config["agent"], task_of(run, env, env_kwargs)
     policy = load(run, task, agent=agent)
+    shortest = policy.min_age(trained_delay(run))
     for delay in range(policy.spec.delay + 1):
-        yield _play(policy, name, task, delay, episodes, seed)
+        yield _play(policy, name, task, delay, episodes, seed) | {"learned": delay >= shortest}
 
 
 def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:

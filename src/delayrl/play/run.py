@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from delayrl.delays import short_label
 from delayrl.errors import DelayRLError
 from delayrl.run.folder import RunFolder, RunLike, is_config, path_of
 from delayrl.run.rows import whole_evaluations
@@ -53,6 +54,11 @@ class Run:
     def config(self) -> dict[str, Any]:
         """What was trained, on what, with which versions. Raises DelayRLError if the folder is no run."""
         return self._folder.config
+
+    @property
+    def delay(self) -> int | str:
+        """The delay that it was trained under, as its rows name it: of a recording, a checksum."""
+        return short_label(self.config["delay"])
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one row for each evaluation episode: what was trained, step, start state, return, length.

@@ -152,8 +152,9 @@ class Result:
     @property
     def threshold(self) -> float:
         """The reference's smoothed return after its last step; NaN without anchors, or if `random` is as good."""
-        better = self.threshold_anchor.value > self.random_anchor.value
-        return statistics.mean_std(self.threshold_anchor.smoothed)[0] if better else NAN
+        reference, random = self.threshold_anchor, self.random_anchor.value
+        smoothed = statistics.mean_std(reference.smoothed)[0] if reference.value > random else NAN
+        return smoothed if smoothed > random else NAN
 
     @property
     def missed(self) -> bool:
