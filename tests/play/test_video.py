@@ -1,5 +1,6 @@
 """What a video shows: the robot, and what is written above it."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -300,3 +301,35 @@ def test_a_renderer_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(video, "render", fail)
     with pytest.raises(DelayRLError, match=r"^delayrl/Walk-v0 cannot be rendered here: no pictures$"):
         next(_episode(make("delayrl/Walk-v0", 3), STILL, 5, None, 4, 1))
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (None, "None"),
+        (np.zeros((4, 4), np.uint8), r"uint8 \[4, 4\]"),
+        (np.zeros((4, 4, 1), np.uint8), r"uint8 \[4, 4, 1\]"),
+        (np.zeros((4, 4, 3)), r"float64 \[4, 4, 3\]"),
+        ([[[0, 0, 0]]], r"int64 \[1, 1, 3\]"),
+        (np.zeros((1, 4, 3), np.uint8), r"uint8 \[1, 4, 3\]"),
+    ],
+)
+def test_what_is_no_picture(given: Any, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make("delayrl/Walk-v0", 3)
+    monkeypatch.setattr(type(env.unwrapped), "render", lambda env: given)
+    with pytest.raises(DelayRLError, match=rf"^the render\(\) of delayrl/Walk-v0 must .*; it returned {line}$"):
+        next(_episode(env, STILL, 5, None, 4, 1))
+
+
+@pytest.mark.parametrize("kind", ["gif", "mp4"])
+def test_a_video_that_fails_keeps_the_file_that_was_there(tmp_path: Path, kind: str) -> None:
+    out = tmp_path / f"x.{kind}"
+    with video._video(out, 15) as add:
+        add(np.full((32, 32, 3), 200, np.uint8))
+    kept = out.read_bytes()
+    with contextlib.suppress(Exception), video._video(out, 15) as add:
+        add(np.full((32, 32, 3), 100, np.uint8))
+        raise ValueError
+    assert out.read_bytes() == kept
+    assert len(kept) > 100
+    assert list(tmp_path.iterdir()) == [out]

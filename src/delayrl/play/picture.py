@@ -67,11 +67,16 @@ def moving_base(model: Any) -> int | None:
 
 
 def render(env: Any) -> Picture:
-    """Render a frame of an environment beside which others may be rendered too."""
+    """Render a frame of an environment beside which others may be rendered too. Raises DelayRLError if it is none."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if renderer is not None and renderer.viewer is not None:
         renderer.viewer.make_context_current()  # OpenGL draws into the last one that was
-    return np.asarray(env.render())
+    picture = np.asarray(env.render())
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape) < 2:
+        gave = "None" if picture.dtype == object and picture.ndim == 0 else f"{picture.dtype} {list(picture.shape)}"
+        what = "an array of uint8 [height, width, 3 or 4], of 2 pixels or more each way"
+        raise DelayRLError(f"the render() of {name_of(env)} must return {what}; it returned {gave}")
+    return picture
 
 
 def close(env: Any) -> None:

@@ -25,6 +25,7 @@ from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load, task_of, trained_delay
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
+from delayrl.run.disk import draft
 from delayrl.run.folder import RunLike, path_of
 
 FASTEST = {".mp4": 60, ".gif": 15}
@@ -152,6 +153,8 @@ def _rendering(task: Task, delay: Delay) -> Any:
 def _picture(env: Any) -> Picture:
     try:
         return render(env)
+    except DelayRLError:
+        raise
     except Exception as error:  # a renderer may raise anything
         mujoco = hasattr(env.unwrapped, "mujoco_renderer")
         hint = "; Linux without a screen needs EGL (package libegl1)" if mujoco else ""
@@ -196,19 +199,22 @@ def _titled(moment: Moment, title: str, several: bool) -> Picture:
 
 @contextmanager
 def _video(out: Path, rate: float) -> Iterator[Callable[[Any], None]]:
-    """Open a video file, and yield the function that adds a frame. Raises DelayRLError if it cannot be written."""
+    """Open a video file, and yield the function that adds a frame. Raises DelayRLError if it cannot be written.
+
+    What fails leaves the file that was there.
+    """
     try:
-        if out.suffix == ".gif":
-            with out.open("wb") as file:
+        with draft(out) as name, name.open("wb") as file:
+            if out.suffix == ".gif":
                 frames: list[Image.Image] = []
                 yield lambda picture: frames.append(_few_colours(picture, frames[:1]))
                 times = _frame_times(len(frames), rate)
                 frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=times, loop=0)
-        else:
-            with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
-                warnings.simplefilter("ignore", RuntimeWarning)
-                with imageio.get_writer(out, fps=rate, macro_block_size=None) as writer:
-                    yield writer.append_data
+            else:
+                with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
+                    warnings.simplefilter("ignore", RuntimeWarning)
+                    with imageio.get_writer(file, format=".mp4", fps=rate, macro_block_size=None) as writer:
+                        yield writer.append_data
     except OSError as error:
         raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
 
