@@ -215,7 +215,20 @@ def test_of_equal_rows_those_that_have_ended_count(finished, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "query", ["DELETE FROM cells WHERE number = 0", "UPDATE cells SET state = 'well'", "UPDATE runs SET config = '{'"]
+    "query",
+    [
+        "DELETE FROM cells WHERE number = 0",
+        "UPDATE cells SET state = 'well'",
+        "UPDATE cells SET steps_per_second = 'fast'",
+        "UPDATE runs SET config = '{'",
+        "UPDATE runs SET config = '[]'",
+        "UPDATE runs SET config = json_set(config, '$.cost', 1)",
+        "UPDATE runs SET shared = json_remove(shared, '$.agent')",
+        "UPDATE runs SET versions = '{}'",
+        "UPDATE rows SET return = NULL",
+        "UPDATE rows SET step = step || 'x'",
+        "UPDATE rows SET more = '[]'",
+    ],
 )
 def test_a_damaged_table_replaces_nothing(finished, tmp_path: Path, query: str) -> None:
     grid, runs = finished
@@ -446,6 +459,7 @@ def test_commit(tmp_path: Path, monkeypatch) -> None:
         ("cell", '{"seeds": {}}'),
         ("state", '"gone"'),
         ("step", '"x"'),
+        ("steps_per_second", '"fast"'),
         ("versions", "[5]"),
     ],
 )

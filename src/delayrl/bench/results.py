@@ -18,9 +18,10 @@ from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
 from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell, CellState, Progress
+from delayrl.run.cost import Cost
 from delayrl.run.disk import draft, lock
 from delayrl.run.folder import RunFolder, versions_in
-from delayrl.run.rows import EPISODE, Row, name_configuration
+from delayrl.run.rows import CONDITION, EPISODE, Row, check_row, name_configuration
 
 SCHEMA = 1
 TABLES = """
@@ -162,18 +163,19 @@ def _insert_cell(table: sqlite3.Connection, cell: Cell, number: int, p: Progress
 def _copy_cell(table: sqlite3.Connection, file: Path, cell: Cell, number: int) -> int:
     """Copy a cell with its runs and rows out of another table. Returns the number of rows."""
     with _open(file) as other:
-        query = "SELECT id, cell, state, step, steps_per_second FROM cells WHERE id = ?"
-        _, p = _stored_cell(*other.execute(query, (cell.id,)).fetchone())
+        held = _read(other, cell.id)  # what cannot be read must not replace what can
+        for config in held.configs:
+            if "cost" in config:
+                Cost.from_json(config["cost"])
+        for row in held.rows:
+            check_row(row, f"cell {cell.id}")
+            if not all(isinstance(row.get(name), kind) for name, kind in CONDITION.items()):
+                raise ValueError(f"rows of cell {cell.id} do not name their condition")
         query = "SELECT id, cell, seed, shared, config, versions FROM runs WHERE cell = ? ORDER BY id"
         runs = other.execute(query, (cell.id,)).fetchall()
         query = f"SELECT {', '.join(EPISODE)}, more FROM rows WHERE run = ?"
         rows = [other.execute(query, (run,)).fetchall() for run, *_ in runs]
-        for text in (
-            *(text for *_, a, b, c in runs for text in (a, b, c)),
-            *(more for own in rows for *_, more in own),
-        ):
-            json.loads(text or "{}")  # what cannot be read must not replace what can
-    _insert_cell(table, cell, number, p)
+    _insert_cell(table, cell, number, held.standing[0][1])
     for (_, *described), own in zip(runs, rows, strict=True):
         run = table.execute("INSERT INTO runs VALUES (NULL, ?, ?, ?, ?, ?)", described).lastrowid
         table.executemany("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", [(run, *row) for row in own])
@@ -225,23 +227,40 @@ def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def read_table(file: Path) -> Collected:
     """Read a collected table. Raises DelayRLError if it is none of ours, damaged, or has another schema version."""
     with _open(file) as table:
-        stored = table.execute("SELECT id, cell, state, step, steps_per_second FROM cells ORDER BY number")
-        cells = [_stored_cell(*values) for values in stored]
-        runs = table.execute("SELECT id, cell, shared FROM runs")
-        shared = {run: json.loads(text) | {"cell": cell} for run, cell, text in runs}
-        rows = [
-            shared[run] | dict(zip(EPISODE, values, strict=True)) | json.loads(more or "{}")
-            for run, more, *values in table.execute(f"SELECT run, more, {', '.join(EPISODE)} FROM rows")
-        ]
-        versions = [dict(v) for (text,) in table.execute("SELECT versions FROM runs") for v in json.loads(text)]
-        configs = [dict(json.loads(text)) for (text,) in table.execute("SELECT config FROM runs ORDER BY id")]
+        return _read(table)
+
+
+def _read(table: sqlite3.Connection, id: str | None = None) -> Collected:
+    """Read a table, or one of its cells. Raises ValueError or TypeError if a text or number is of another type."""
+    only, given = ("", ()) if id is None else ("WHERE {} = ?", (id,))
+    query = f"SELECT id, cell, state, step, steps_per_second FROM cells {only.format('id')} ORDER BY number"
+    cells = [_stored_cell(*values) for values in table.execute(query, given)]
+    query = f"SELECT id, cell, shared, config, versions FROM runs {only.format('cell')} ORDER BY id"
+    runs = table.execute(query, given).fetchall()
+    shared = {run: _loaded(text, dict) | {"cell": cell} for run, cell, text, *_ in runs}
+    query = f"SELECT run, more, {', '.join(EPISODE)} FROM rows"
+    if id is not None:
+        query += " WHERE run IN (SELECT id FROM runs WHERE cell = ?)"
+    rows = [
+        shared[run] | dict(zip(EPISODE, values, strict=True)) | _loaded(more or "{}", dict)
+        for run, more, *values in table.execute(query, given)
+    ]
+    versions = [dict(used) for *_, text in runs for used in _loaded(text, list)]
+    configs = [_loaded(text, dict) for *_, text, _ in runs]
     return Collected(rows, cells, _distinct(versions), configs)
 
 
+def _loaded(text: str, kind: type) -> Any:
+    value = json.loads(text)
+    if not isinstance(value, kind):
+        raise ValueError(f"it holds {text[:60]!r} in the place of a {kind.__name__}")
+    return value
+
+
 def _stored_cell(id: str, text: str, state: CellState, step: int, speed: float | None) -> tuple[Cell, Progress]:
-    if state not in get_args(CellState) or type(step) is not int:
-        raise ValueError(f"cell {id} has an invalid state or step")
-    return Cell.from_json(dict(json.loads(text)), id), Progress(state, step, speed)
+    if state not in get_args(CellState) or type(step) is not int or not isinstance(speed, float | None):
+        raise ValueError(f"cell {id} has an invalid state, step or speed")
+    return Cell.from_json(_loaded(text, dict), id), Progress(state, step, speed)
 
 
 @contextlib.contextmanager
@@ -255,7 +274,7 @@ def _open(file: Path) -> Iterator[sqlite3.Connection]:
             if version == (str(SCHEMA),):
                 yield table
                 return
-    except (sqlite3.Error, ValueError, KeyError, TypeError, DelayRLError) as error:
+    except (sqlite3.Error, ValueError, KeyError, TypeError, RecursionError, DelayRLError) as error:
         raise DelayRLError(f"{file} is no table of results, or damaged: {error}") from error
     other = version[0] if version else "none"
     raise DelayRLError(f"{file} has schema version {other}, this program reads {SCHEMA}: collect into another file")
