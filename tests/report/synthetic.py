@@ -97,6 +97,13 @@ def anchored(cells: dict[str, Standing], **curves: list[list[float]]) -> list[di
     return [r for name, runs in curves.items() for seed, c in enumerate(runs) for r in curve(cells[name], seed, c)]
 
 
+def two_lengths() -> tuple[list[Standing], list[dict[str, Any]]]:
+    """Cells and rows of agents that end after 400 and after 800 steps, each with its delay-free SAC."""
+    some = (("vdpo", 5, 400), ("vdpo", 25, 400), ("bpql", 5, 800), ("sac", 0, 400), ("sac", 0, 800), ("random", 0, 400))
+    cells = [standing(agent, "Ant", delay, 2, f"{agent}{delay}{steps}", steps=steps) for agent, delay, steps in some]
+    return cells, list(rows(cells, evaluations=4, episodes=1))
+
+
 def nasty() -> tuple[list[Standing], list[dict[str, Any]]]:
     """Cells and rows whose names try to break out of the page."""
     given: dict[str, Any] = {"preset": EVIL, "protocol": EVIL, "steps": 200}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic import EVIL, NASTY, anchored, full_grid, nasty, rows, small
+from synthetic import EVIL, NASTY, anchored, full_grid, nasty, rows, small, two_lengths
 
 from delayrl.report.page import page, payload
 from delayrl.report.report import report
@@ -200,6 +200,17 @@ def test_page_draws_curves_and_shows_values(opened: Any) -> None:
     assert view.locator("#curves figure svg").first.locator("text").all_inner_texts() != axis
     view.locator("#curves button", has_text="each seed").click()
     assert view.locator("#curves polyline").count() > 3 * view.locator("#curves polyline.curve").count()
+
+
+def test_page_draws_the_delay_free_line_of_each_length(opened: Any) -> None:
+    """Two labelled ones, where results of two lengths share a panel; normalised both are 1."""
+    cells, every = two_lengths()
+    view = opened(summarise(every, cells))
+    marks = [sorted(figure.locator("text.mark").all_text_contents()) for figure in view.locator("#curves figure").all()]
+    assert marks == [["400 steps", "800 steps"], []]  # at Δ = 5, and at 25, where there is one agent
+    assert sorted(view.locator("#delay text.mark").all_text_contents()) == ["400 steps", "800 steps"]
+    view.locator("#curves button", has_text="normalised").click()
+    assert view.locator("text.mark").count() == 0
 
 
 @pytest.mark.thorough

@@ -4,14 +4,18 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from synthetic import small
+from matplotlib.figure import Figure
+from synthetic import rows, small, standing, two_lengths
 
 from delayrl.errors import DelayRLError
+from delayrl.report import figures
 from delayrl.report.__main__ import main
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
+from delayrl.report.summary import summarise
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
@@ -35,6 +39,42 @@ def test_report_of_committed_rows(tmp_path: Path) -> None:
         assert (tmp_path / picture).stat().st_size > 10_000
     assert "**1.02 ± 0.03**<br>0.97 to 1.07<br>area 0.99 ± 0.01<br>raw -7.40 ± 0.95" in text  # bpql on Reacher-v5
     assert out.stat().st_size < 1_000_000
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The figures that are drawn, in the place of files."""
+    made: list[Any] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: made.append(figure))
+    return made
+
+
+def words(text: Any) -> str:
+    """A text without its line breaks."""
+    return " ".join(text.get_text().split())
+
+
+def test_pictures_keep_alike_names_apart_and_titles_whole(tmp_path: Path, drawn: list[Any]) -> None:
+    """What tells them apart may stand at the end of a long name, or in its middle."""
+    law, long = "my_laws:Busy(slow=4, fast=1, busy=0.25, quiet=0.125, seed=12)@fifo", dict.fromkeys("abcdefghij", 0.001)
+    cells = [standing("bpql", "Ant", law, overrides=long | {"e": x, "z": y}) for x in (1, 2) for y in (1, 2)]
+    cells += [standing("bpql", "Ant", law), standing("sac", "Ant", 0), standing("random", "Ant", 0)]
+    summary = summarise(rows(cells, evaluations=4, episodes=1), cells)
+    figures.draw(summary, tmp_path)
+    assert len(summary.labels) == 7
+    for figure in drawn:
+        assert {words(text) for text in figure.legends[0].get_texts()} >= {*summary.labels} - {"sac", "random"}
+    titles = [[words(panel.title) for panel in figure.axes] for figure in drawn]
+    assert titles == [[f"Ant, Δ = {law}"], [f"IQM, Δ = {law}", f"Profile, Δ = {law}"]]
+
+
+def test_pictures_draw_the_delay_free_line_of_each_length(tmp_path: Path, drawn: list[Any]) -> None:
+    cells, every = two_lengths()
+    figures.draw(summarise(every, cells), tmp_path)
+    marks = [[text.get_text() for text in figure.axes[0].texts] for figure in drawn]
+    assert marks == [["400 steps", "800 steps"], [], ["400 steps", "800 steps"], []]
+    lines = {round(line.get_ydata()[0]) for line in drawn[0].axes[0].lines if line.get_label() == figures.SAC[0]}
+    assert len(lines) == 2
 
 
 def test_command(tmp_path: Path) -> None:

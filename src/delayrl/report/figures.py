@@ -1,6 +1,7 @@
 """Pictures of a summary, as PNG files."""
 
 import math
+import textwrap
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ Look = tuple[str, str, str, str]  # name, then a style
 SAC: Look = ("delay-free SAC", *STYLES["sac"])
 RANDOM: Look = ("random", *STYLES["random"])
 DASHES = ("5 2", "2 3", "9 2 2 2", "")
+NAME, TITLE = 60, 40  # letters in a line
 
 
 def styles(labels: Sequence[str]) -> dict[str, tuple[str, str, str]]:
@@ -95,26 +97,45 @@ def _save(figure: Any, path: Path) -> None:
     for panel in figure.axes:
         lines |= {label: line for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
     names = sorted(lines, key=lambda name: (name in (SAC[0], RANDOM[0]), agent_order(name)))
-    look = {"loc": "outside lower center", "ncols": min(5, int(figure.get_figwidth() / 2)), "frameon": False}
-    figure.legend([lines[key] for key in names], names, fontsize=9, **look)
+    drawn, width = [_drawn(name) for name in names], figure.get_figwidth()
+    longest = max((len(line) for name in drawn for line in name.splitlines()), default=0)
+    columns = max(1, int(min(5, width / 2, width / (0.6 + 0.075 * longest))))
+    look = {"loc": "outside lower center", "ncols": columns, "frameon": False}
+    below = max(0, math.ceil(sum(name.count("\n") + 1 for name in drawn) / columns) - 2)
+    above = max(panel.get_title().count("\n") for panel in figure.axes) * figure.axes[0].get_gridspec().nrows
+    figure.set_figheight(figure.get_figheight() + 0.17 * (below + above))  # lines beyond the usual ones
+    figure.legend([lines[name] for name in names], drawn, fontsize=9, **look)
     figure.savefig(path, dpi=110)
 
 
 def _line(look: Look) -> dict[str, Any]:
     name, colour, _, dashes = look
     dash = tuple(float(x) / 1.5 for x in dashes.split())
-    return {"label": _plain(name), "color": colour, "linestyle": (0, dash) if dash else "-", "linewidth": 1.8}
+    return {"label": name, "color": colour, "linestyle": (0, dash) if dash else "-", "linewidth": 1.8}
 
 
-def _plain(text: str) -> str:
-    """Make a name from the rows drawable: short, no formula, no lone surrogates."""
-    return text[:60].encode("utf-8", "replace").decode().replace("$", r"\$")
+def _drawn(text: str, letters: int = NAME) -> str:
+    """Make text from the rows drawable: in lines of so many letters, no formula, no lone surrogates.
+
+    What tells two names apart may stand anywhere in them, so that only very long ones are cut, in the middle.
+    """
+    text = text if len(text) <= 400 else f"{text[:200]} … {text[-200:]}"
+    lines = textwrap.fill(text.encode("utf-8", "replace").decode(), letters, break_on_hyphens=False)
+    return lines.replace("$", r"\$")
 
 
-def _anchor_lines(axes: Any, result: Result) -> None:
-    for anchor, look in ((result.reference_anchor, SAC), (result.random_anchor, RANDOM)):
-        if not math.isnan(anchor.value):
-            axes.axhline(anchor.value, **_line(look) | {"linewidth": 1.1})
+def _anchor_lines(axes: Any, results: Sequence[Result]) -> None:
+    """Draw the random policy and delay-free SAC. One that not all results share says of which length it is."""
+    for kind, look in (("reference_anchor", SAC), ("random_anchor", RANDOM)):
+        lines = {r.condition.steps: getattr(r, kind).value for r in results}
+        shared = len({None if math.isnan(value) else value for value in lines.values()}) == 1
+        for steps, value in sorted(lines.items())[: 1 if shared else None]:
+            if math.isnan(value):
+                continue
+            axes.axhline(value, **_line(look) | {"linewidth": 1.1})
+            if not shared:
+                place = {"xy": (1, value), "xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+                axes.annotate(f"{steps:,} steps", fontsize=7, color=look[1], **place)
 
 
 def _curves(results: list[Result], delay: int | str, looks: dict[str, Look], path: Path) -> None:
@@ -128,8 +149,8 @@ def _curves(results: list[Result], delay: int | str, looks: dict[str, Look], pat
             if result.runs > 1:
                 std = result.curves.returns.std(0, ddof=1)
                 axes.fill_between(steps, mean - std, mean + std, color=style["color"], alpha=0.13, lw=0)
-        _anchor_lines(axes, mine[0])
-        axes.set_title(f"{_plain(task)}, Δ = {_plain(str(delay))}", fontsize=10)
+        _anchor_lines(axes, mine)
+        axes.set_title(_drawn(f"{task}, Δ = {delay}", TITLE), fontsize=10)
         axes.set(xlabel="environment steps", ylabel="return")
         axes.ticklabel_format(axis="both", style="sci", scilimits=(-3, 4))
     _save(figure, path)
@@ -145,9 +166,8 @@ def _against_delay(results: list[Result], looks: dict[str, Look], path: Path) ->
             mean, std = np.array([mean_std(r.curves.final) for r in points]).T
             delays, style = [r.place.delay for r in points], _line(looks[label])
             axes.errorbar(delays, mean, np.nan_to_num(std), marker="o", markersize=4, capsize=2, **style)
-        if mine:
-            _anchor_lines(axes, mine[0])
-        axes.set_title(_plain(task), fontsize=10)
+        _anchor_lines(axes, mine)
+        axes.set_title(_drawn(task, TITLE), fontsize=10)
         axes.set(xlabel="delay (steps)", ylabel="return")
     _save(figure, path)
 
@@ -155,20 +175,22 @@ def _against_delay(results: list[Result], looks: dict[str, Look], path: Path) ->
 def _aggregates(aggregates: list[Aggregate], looks: dict[str, Look], path: Path) -> None:
     """IQM with its interval, and the performance profile beside it, a line for each delay."""
     delays = list(dict.fromkeys(a.delay for a in aggregates))
-    longest = max(len(_plain(looks[a.label][0])) for a in aggregates)  # names stand beside the left panels
-    figure, panels = _panels(len(delays), 2, (8 + 0.08 * longest, 2.8 * len(delays) + 0.5))
+    names = {a.label: _drawn(looks[a.label][0]) for a in aggregates}  # they stand beside the left panels
+    longest = max(len(line) for name in names.values() for line in name.splitlines())
+    lines = max(name.count("\n") + 1 for name in names.values())
+    figure, panels = _panels(len(delays), 2, (8 + 0.08 * longest, (2.4 + 0.4 * lines) * len(delays) + 0.5))
     for (left, right), delay in zip(panels, delays, strict=True):
         mine = [a for a in aggregates if a.delay == delay]
-        title = "all constant delays" if delay is None else f"Δ = {_plain(str(delay))}"
+        title = "all constant delays" if delay is None else f"Δ = {delay}"
         for height, a in enumerate(reversed(mine)):
             style = _line(looks[a.label])
             left.plot([a.low, a.high], [height, height], color=style["color"], linewidth=6, alpha=0.3)
             left.plot(a.iqm, height, "o", color=style["color"])
             right.plot(THRESHOLDS, a.profile, **style)
             right.fill_between(THRESHOLDS, a.profile_low, a.profile_high, color=style["color"], alpha=0.12, lw=0)
-        left.set_yticks(range(len(mine)), [_plain(looks[a.label][0]) for a in reversed(mine)])
-        left.set(title=f"IQM, {title}", xlabel="normalised return", ylim=(-0.6, len(mine) - 0.4))
-        right.set(title=f"Profile, {title}", xlabel="normalised return τ", ylabel="runs above τ")
+        left.set_yticks(range(len(mine)), [names[a.label] for a in reversed(mine)])
+        left.set(title=_drawn(f"IQM, {title}", TITLE), xlabel="normalised return", ylim=(-0.6, len(mine) - 0.4))
+        right.set(title=_drawn(f"Profile, {title}", TITLE), xlabel="normalised return τ", ylabel="runs above τ")
         for panel in (left, right):
             panel.title.set_fontsize(10)
     _save(figure, path)
