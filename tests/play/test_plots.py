@@ -1,0 +1,17 @@
+"""Pictures of runs: their names are text, not formulas."""
+
+from pathlib import Path
+
+import numpy as np
+
+from delayrl.play import plots
+
+
+def test_names_with_two_dollar_signs(tmp_path: Path) -> None:
+    """A task's keyword argument may hold them, such as a path. Between them matplotlib reads a formula."""
+    name = 'my_tasks:Arm(model="$HOME/my_$arm")'
+    row = {"agent": name, "env": name, "delay": name, "seed": 0, "policy": "agent", "step": 1, "return": 1.0}
+    plots.curve([row], tmp_path / "curve.png")
+    plots.against_delay([row | {"delay": 1, "returns": [1.0], "episodes": 1}], tmp_path / "delays.png")
+    plots.curves([(name, np.ones(1), np.ones((2, 1)))], tmp_path / "curves.png", name)
+    assert len(list(tmp_path.iterdir())) == 3
