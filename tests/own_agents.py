@@ -74,8 +74,18 @@ class Steps(Shrink):
 
 
 @dataclass(frozen=True)
-class Seed(Shrink):
-    seed: Annotated[int, "is an option of the command"] = 3
+class Progress(Shrink):
+    progress: Annotated[int, "is a parameter of train"] = 3
+
+
+@dataclass(frozen=True)
+class Quiet(Shrink):
+    quiet: Annotated[int, "is an option of the command"] = 3
+
+
+@dataclass(frozen=True)
+class Percent(Shrink):
+    share: Annotated[int, "% of all, 5 %s"] = 3
 
 
 @dataclass(frozen=True)

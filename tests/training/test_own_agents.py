@@ -1,5 +1,6 @@
 """Agents of a user are trained, resumed, evaluated, loaded and exported; in grids and from the command line too."""
 
+import inspect
 import json
 import sys
 import warnings
@@ -23,7 +24,7 @@ from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.play.run import Run
 from delayrl.play.video import watch
-from delayrl.run.agents import as_agent, find_agent, known_agents
+from delayrl.run.agents import TAKEN, as_agent, find_agent, known_agents
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.condition import overrides_of, resolve
 from own_agents import Shrink
@@ -255,6 +256,7 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
         ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
         ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
         ("own_agents:Steps", "has an option steps, as every run has"),
+        ("own_agents:Progress", "has an option progress, as every run has"),
         ("own_agents:Wordy", "name must be a number; got 'me'"),
         ("not_there:Agent", "cannot import 'not_there': ModuleNotFoundError"),
         ("os:system", "os:system is no agent"),
@@ -268,9 +270,20 @@ def test_what_is_no_agent(name: str, words: str) -> None:
 
 def test_an_option_of_the_command_is_refused(capsys) -> None:
     with pytest.raises(SystemExit):
-        main(["train", "own_agents:Seed", "--env", "Reacher-v5"])
-    line = "delayrl: the agent has an option --seed, as the command has: give it another name\n"
+        main(["train", "own_agents:Quiet", "--env", "Reacher-v5"])
+    line = "delayrl: the agent has an option --quiet, as the command has: give it another name\n"
     assert capsys.readouterr().err == line
+
+
+def test_names_that_no_option_can_have() -> None:
+    parameters = inspect.signature(delayrl.train).parameters.values()
+    assert list(TAKEN) == [one.name for one in parameters if one.kind is not one.VAR_KEYWORD]
+
+
+def test_an_option_with_a_percent_sign(capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "own_agents:Percent", "--help"])
+    assert "% of all, 5 %s (default: 3)" in " ".join(capsys.readouterr().out.split())
 
 
 # ------------------------------------------------------------------------------------------------ stored runs

@@ -87,8 +87,9 @@ def _add_group(parser: Parser, title: str, config: Any) -> None:
             settings |= Numbers.of(_reader(get_args(option.kind)[0]))
             default = " ".join(map(str, default))
         name = f"--{option.name.replace('_', '-')}"
+        words = f"{option.help} (default: {default})".replace("%", "%%")
         try:
-            group.add_argument(name, default=argparse.SUPPRESS, help=f"{option.help} (default: {default})", **settings)
+            group.add_argument(name, default=argparse.SUPPRESS, help=words, **settings)
         except argparse.ArgumentError as error:
             raise DelayRLError(f"the agent has an option {name}, as the command has: give it another name") from error
 
