@@ -236,6 +236,7 @@ def setup_of(c: Condition) -> Setup:
 
 BAD = [
     ("agents = [", "is not a valid TOML file"),
+    ("agents = " + "[" * 3000 + "]" * 3000, "is not a valid TOML file"),
     ("product = []", "there are no products, so nothing to run"),
     (BASIC + "product = []", "there are no products, so nothing to run"),
     ('agent = ["bpql"]\n', "unknown key 'agent' of the grid"),
@@ -291,6 +292,16 @@ def test_bad_grids(text: str, words: str, tmp_path: Path, monkeypatch, capsys) -
     assert err.count("\n") == 1
     assert words in err
     assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("text", [b"", b"[]", b"null", b"{}", b"\xff", b'{"source": 1}'])
+def test_a_damaged_claim_is_made_anew(text: bytes, tmp_path: Path) -> None:
+    grid, claimed = load_grid(write(tmp_path, BASIC)), tmp_path / "runs" / "grids" / "grid.json"
+    claim(tmp_path / "runs", grid)
+    whole = claimed.read_bytes()
+    claimed.write_bytes(text)
+    claim(tmp_path / "runs", grid)
+    assert claimed.read_bytes() == whole
 
 
 def test_two_grids_of_one_name(tmp_path: Path) -> None:

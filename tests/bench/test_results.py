@@ -19,7 +19,7 @@ from delayrl.bench.status import progress, standing
 from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
 from delayrl.run import provenance
-from delayrl.run.cell import Cell
+from delayrl.run.cell import Cell, Progress
 from delayrl.run.disk import lock
 from delayrl.run.folder import RunFolder
 
@@ -223,6 +223,7 @@ def test_of_equal_rows_those_that_have_ended_count(finished, tmp_path: Path) -> 
         "UPDATE runs SET config = '{'",
         "UPDATE runs SET config = '[]'",
         "UPDATE runs SET config = json_set(config, '$.cost', 1)",
+        "UPDATE runs SET config = json_set(config, '$.configuration', json('[1]'))",
         "UPDATE runs SET shared = json_remove(shared, '$.agent')",
         "UPDATE runs SET versions = '{}'",
         "UPDATE rows SET return = NULL",
@@ -304,6 +305,24 @@ def test_a_damaged_row(finished, tmp_path: Path, change: str) -> None:
             what()
         assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"[1]", b"[]", b"null", b"\xff", b"[" * 3000, b'{"step": "x", "steps_per_second": "fast"}', b'{"step": 1e999}'],
+)
+def test_damaged_lines_of_journal_and_metrics(finished, tmp_path: Path, line: bytes) -> None:
+    """They are as if they were not there."""
+    grid, runs = finished
+    shutil.copytree(runs, tmp_path / "runs")
+    home = tmp_path / "runs" / grid.cells[0].folder
+    for file in (home / "journal.jsonl", home / "seed0" / "metrics.jsonl"):
+        with open(file, "ab") as end:
+            end.write(line + b"\n")
+    assert folders.journal(home) == folders.journal(runs / grid.cells[0].folder)
+    assert progress(grid.cells[0], tmp_path / "runs") == Progress("done", 60)
+    with folders.hold_cell(home):
+        assert progress(grid.cells[0], tmp_path / "runs")[:2] == ("running", 60)
 
 
 def test_worker(finished, tmp_path: Path) -> None:

@@ -152,6 +152,11 @@ def test_values_of_keyword_arguments(text: str, value: object) -> None:
     assert type(pair(f"name={text}")[1]) is type(value)
 
 
+def test_a_keyword_argument_of_thousands_of_brackets() -> None:
+    with pytest.raises(delayrl.DelayRLError, match=r"^the value of name is nested too deeply$"):
+        pair("name=" + "[" * 3000 + "]" * 3000)
+
+
 def test_a_run_folder_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
     line = "there is no run folder runs/nowhere/seed0; `delayrl runs` lists the runs below runs/"
     assert line in refused(capsys, "train", "runs/nowhere/seed0", "--steps", "300")

@@ -129,6 +129,14 @@ def test_collected_files_keep_configurations(tmp_path: Path) -> None:
     assert finals(tmp_path / "out.jsonl") == {"bpql": [1.0], "bpql discount=0.9": [2.0]}
 
 
+@pytest.mark.parametrize("change", [{"versions": "x"}, {"later_versions": 1}, {"configuration": [1]}, {"origin": 1}])
+def test_a_damaged_configuration_in_a_collected_file(change: Any, tmp_path: Path) -> None:
+    config = json.loads((made(tmp_path / "a", 1.0).parent / "config.json").read_text())
+    (tmp_path / "out.jsonl").write_text(json.dumps({"config": config | change}) + "\n")
+    with pytest.raises(DelayRLError, match=r"^a configuration in .*out.jsonl is damaged: no good \w+: "):
+        list(read_configs([tmp_path / "out.jsonl"]))
+
+
 def test_overrides_are_those_of_the_preset() -> None:
     config = resolve("dida", "Pendulum-v1", 3, "small", "corrected", {"steps": 30_000, "student_hidden": [8]}).config
     assert overrides_of(json.loads(json.dumps(config))) == {"steps": 30_000, "student_hidden": [8]}

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -104,6 +105,21 @@ def test_a_schedule_without_steps_is_damaged(run: RunFolder) -> None:
     (run.path / "config.json").write_text(json.dumps(run.config | {"schedule": {}}))
     with pytest.raises(DelayRLError, match=r"config.json is damaged: its schedule has no steps$"):
         print(run.config)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("versions", "x"), ("later_versions", 1), ("later_versions", [1]), ("configuration", [1])]
+)
+def test_what_a_configuration_holds_besides_is_checked(name: str, value: object, run: RunFolder) -> None:
+    (run.path / "config.json").write_text(json.dumps(run.config | {name: value}))
+    with pytest.raises(DelayRLError, match=f"config.json is damaged: no good {name}: {re.escape(repr(value))}$"):
+        print(run.config)
+
+
+def test_a_line_that_is_no_object(run: RunFolder) -> None:
+    (run.path / "metrics.jsonl").write_text("[1]\n")
+    with pytest.raises(DelayRLError, match=r"metrics.jsonl is damaged: a line is no object$"):
+        run.read("metrics")
 
 
 def test_a_damaged_row_is_one_line(run: RunFolder) -> None:

@@ -13,6 +13,7 @@ RUNS/TASK-delayN-AGENT-ID/       a cell; grids that contain the same cell share 
 
 import contextlib
 import json
+import math
 import os
 import platform
 import time
@@ -81,12 +82,9 @@ def note(folder: Path, event: str, **details: Any) -> None:
 
 
 def journal(folder: Path) -> list[dict[str, Any]]:
-    """Return the cell's events, oldest first. Lines that a crash cut off are ignored."""
-    events = []
-    for line in _text(folder / "journal.jsonl").splitlines():
-        with contextlib.suppress(ValueError):
-            events.append(json.loads(line))
-    return events
+    """Return the cell's events, oldest first. Lines that a crash cut off, or a disk damaged, are ignored."""
+    found = map(_loaded, _text(folder / "journal.jsonl").splitlines())
+    return [event for event in found if "event" in event]
 
 
 def seed_paths(folder: Path, seeds: tuple[int, ...]) -> list[Path]:
@@ -106,15 +104,16 @@ def stored(folder: Path, seeds: tuple[int, ...]) -> tuple[int, bool]:
 
 
 def newest_metrics(run: Path) -> dict[str, Any]:
-    """Return the last complete line of a run's metrics, or an empty dict if there is none."""
+    """Return the numbers in the last complete line of a run's metrics, or an empty dict if there is none."""
     try:
         with open(run / "metrics.jsonl", "rb") as file:
             file.seek(0, os.SEEK_END)
             file.seek(max(0, file.tell() - 8192))
             lines = file.read().split(b"\n")[:-1]
-        return dict(json.loads(lines[-1]))
-    except (OSError, ValueError, IndexError):
+        found = _loaded(lines[-1].decode(errors="replace"))
+    except (OSError, IndexError):
         return {}
+    return {name: value for name, value in found.items() if isinstance(value, int | float) and abs(value) < math.inf}
 
 
 def prepare(folder: Path, cell: "Cell") -> None:
@@ -130,9 +129,8 @@ def claim(runs: Path, grid: "Grid", *, check_only: bool = False) -> None:
     """
     file = runs / "grids" / f"{grid.name}.json"
     source = f"delayrl:{grid.name}" if grid.is_shipped else os.path.relpath(grid.source.resolve(), runs.resolve())
-    recorded = claimed = {"source": source, "cells": grid.ids}
-    with contextlib.suppress(ValueError):
-        recorded = json.loads(_text(file))
+    claimed = {"source": source, "cells": grid.ids}
+    recorded = claimed | _loaded(_text(file))
     if recorded["source"] != source and recorded["cells"] != grid.ids:
         raise DelayRLError(
             f"two grids are named {grid.name!r}: {recorded['source']} (seen from {runs}) has used the name there; "
@@ -159,6 +157,15 @@ def _write(file: Path, text: str) -> None:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text()
+        return file.read_text(errors="replace")
     except OSError:
         return ""
+
+
+def _loaded(text: str) -> dict[str, Any]:
+    """Return the object that a text holds, empty if it holds none."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}

@@ -104,7 +104,7 @@ def _read(grid: str, folder: Path) -> tuple[Path, dict[str, Any]]:
         return source, tomllib.loads(source.read_text())
     except FileNotFoundError as error:
         raise DelayRLError(f"there is no grid file {source}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise DelayRLError(f"{source} is not a valid TOML file: {error}") from error
 
 

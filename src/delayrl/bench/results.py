@@ -20,7 +20,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.cost import Cost
 from delayrl.run.disk import draft, lock
-from delayrl.run.folder import RunFolder, versions_in
+from delayrl.run.folder import RunFolder, check_more, versions_in
 from delayrl.run.rows import CONDITION, EPISODE, Row, check_row, name_configuration
 
 SCHEMA = 1
@@ -247,6 +247,8 @@ def _read(table: sqlite3.Connection, id: str | None = None) -> Collected:
     ]
     versions = [dict(used) for *_, text in runs for used in _loaded(text, list)]
     configs = [_loaded(text, dict) for *_, text, _ in runs]
+    for config in configs:
+        check_more(config, "a configuration")
     return Collected(rows, cells, _distinct(versions), configs)
 
 

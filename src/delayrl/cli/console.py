@@ -68,8 +68,12 @@ def pair(word: str) -> tuple[str, Any]:
     if not name.isidentifier() or not equals:
         raise DelayRLError(f"keyword arguments are written NAME=VALUE, e.g. gain=2; got {word!r}")
     for read in (json.loads, ast.literal_eval):
-        with suppress(ValueError, SyntaxError, TypeError):
+        try:
             return name, read(text)
+        except (ValueError, SyntaxError, TypeError):
+            continue
+        except (RecursionError, MemoryError) as error:
+            raise DelayRLError(f"the value of {name} is nested too deeply") from error
     return name, text
 
 

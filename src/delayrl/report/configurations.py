@@ -9,7 +9,7 @@ from typing import Any
 from delayrl.errors import DelayRLError
 from delayrl.report.rows import Key, RowGroup
 from delayrl.run.condition import Condition, overrides_of
-from delayrl.run.folder import RunFolder
+from delayrl.run.folder import RunFolder, check_more
 
 Config = Mapping[str, Any]
 """What a run's config.json holds."""
@@ -25,9 +25,13 @@ def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
             continue
         try:
             lines = [line for line in path.read_bytes().splitlines() if b'"config"' in line]
-            yield from (line["config"] for line in map(json.loads, lines) if "config" in line)
-        except (OSError, ValueError, TypeError) as error:
+            configs = [line["config"] for line in map(json.loads, lines) if "config" in line]
+        except (OSError, ValueError, TypeError, RecursionError) as error:
             raise DelayRLError(f"{path} cannot be read: {error}") from error
+        for config in configs:
+            if isinstance(config, dict):
+                check_more(config, f"a configuration in {path}")
+        yield from configs
 
 
 def by_key(configs: Iterable[Config]) -> dict[Key, Config]:

@@ -33,6 +33,8 @@ FORMAT = 1
 NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
 CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
+MORE: dict[str, Any] = {"versions": dict, "later_versions": list, "configuration": str, "origin": dict}
+"""What it may hold besides."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")
 FILES = (*(f"{name}.jsonl" for name in LINES), "curve.png", "delays.png", "config.json")
@@ -67,13 +69,7 @@ class RunFolder:
             config = json.loads(file.read_text())
         except (ValueError, OSError, RecursionError) as error:
             raise DelayRLError(f"{file} is damaged: {type(error).__name__}") from error
-        for name, kind in CONFIG.items():
-            if not isinstance(config, dict) or not isinstance(config.get(name), kind):
-                raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
-        if not isinstance(config["schedule"].get("steps"), int):
-            raise DelayRLError(f"{file} is damaged: its schedule has no steps")
-        if config["format"] != FORMAT:
-            raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
+        _check_config(config, file)
         return config  # type: ignore[no-any-return]
 
     def check_exists(self) -> None:
@@ -114,6 +110,8 @@ class RunFolder:
             rows = [json.loads(line) for line in lines if line.endswith("\n")]
         except (ValueError, RecursionError) as error:
             raise DelayRLError(f"{file} is damaged: {error}") from error
+        if name != "rows" and not all(isinstance(row, dict) for row in rows):
+            raise DelayRLError(f"{file} is damaged: a line is no object")
         return [check_row(row, file) for row in rows] if name == "rows" else rows
 
     def extend(self, config: Mapping[str, Any]) -> None:
@@ -253,6 +251,25 @@ def _below(path: Path) -> list[Path]:
 def versions_in(config: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the versions, commits and hardware that a run was trained with: one, and those that it went on with."""
     return [used for used in (config.get("versions"), *config.get("later_versions", [])) if used]
+
+
+def _check_config(config: Any, file: Path) -> None:
+    for name, kind in CONFIG.items():
+        if not isinstance(config, dict) or not isinstance(config.get(name), kind):
+            raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
+    if not isinstance(config["schedule"].get("steps"), int):
+        raise DelayRLError(f"{file} is damaged: its schedule has no steps")
+    if config["format"] != FORMAT:
+        raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
+    check_more(config, file)
+
+
+def check_more(config: Mapping[str, Any], where: object) -> None:
+    """Raise DelayRLError, naming `where`, if what a configuration holds besides is of another type."""
+    for name, kind in MORE.items():
+        value = config.get(name, kind())
+        if not isinstance(value, kind) or (kind is list and not all(isinstance(part, dict) for part in value)):
+            raise DelayRLError(f"{where} is damaged: no good {name}: {value!r:.60}")
 
 
 def is_config(file: Path) -> bool:
