@@ -86,6 +86,16 @@ def test_steps_and_rewards_that_are_not_repeated_are_named_too(env: Any, wrapper
         train("random", tmp_path / "run", env=env, wrappers=wrappers)
 
 
+def test_a_stopped_run_whose_rewards_are_not_repeated_does_not_go_on(tmp_path: Path, monkeypatch) -> None:
+    """Within an episode, of which a checkpoint here lies in the middle. Observations alone would not show it."""
+    options: dict[str, Any] = {"env": Arm, "wrappers": [NormalizeReward, LIMIT], "evaluate_every": 75}
+    with (
+        pytest.warns(delayrl.DelayWarning),
+        pytest.raises(DelayRLError, match="does not repeat an episode from its seed"),
+    ):
+        killed_and_resumed("random", tmp_path / "run", monkeypatch, **options)
+
+
 def test_environments_are_closed(tmp_path: Path) -> None:
     """Whoever makes one, also where nothing is played. An environment may hold a window, a process or a robot."""
     open_now: set[int] = set()
