@@ -393,6 +393,9 @@ def test_a_grid_stays_a_grid(finished, tmp_path: Path, monkeypatch, capsys) -> N
     monkeypatch.chdir(tmp_path)
     main(["bench", "report", "smoke"])
     assert "smoke: 0 of 10 cells are done" in capsys.readouterr().out
+    (page,) = tmp_path.glob("**/smoke-report/report.html")
+    for file in (page, page.with_name("report.md")):
+        assert load_grid("smoke").description in file.read_text()
     main(["bench", "report", "./smoke"])
     assert "smoke: 1 of 2 cells are done" in capsys.readouterr().out
 

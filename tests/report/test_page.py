@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic import EVIL, NASTY, anchored, full_grid, nasty, rows, small, two_lengths
+from synthetic import EVIL, NASTY, anchored, full_grid, nasty, rows, small, standing, two_lengths
 
 from delayrl.report.page import page, payload
 from delayrl.report.report import report
@@ -80,9 +80,9 @@ def opened(browser: Any, tmp_path: Path) -> Iterator[Any]:
     errors: list[str] = []
     pages = []
 
-    def open_page(summary: Summary, title: str = "Synthetic", **options: Any) -> Any:
+    def open_page(summary: Summary, title: str = "Synthetic", description: str = "", **options: Any) -> Any:
         out = tmp_path / "report.html"
-        out.write_text(page(summary, title))
+        out.write_text(page(summary, title, description=description))
         view = browser.new_page(**options)
         pages.append(view)
         view.on("console", lambda message: errors.append(message.text))
@@ -240,6 +240,16 @@ def test_page_in_light_and_dark(opened: Any, tmp_path: Path) -> None:
 def test_page_on_a_phone(opened: Any) -> None:
     view = opened(sampled(), viewport={"width": 390, "height": 800})
     assert view.evaluate("document.documentElement.scrollWidth") <= 390  # tables scroll, the page does not
+
+
+def test_page_begins_with_what_must_be_known(opened: Any) -> None:
+    """The grid's description, and what is overridden in all cells; machines and libraries come last."""
+    cells = [standing("bpql", "Ant", 5, 1, steps=200, overrides={"width": 8})]
+    view = opened(summarise(rows(cells, evaluations=2, episodes=1), cells), description=f"Wide or not {EVIL}.")
+    assert view.locator("#head p").all_inner_texts()[1:] == [
+        f"Wide or not {EVIL}.",
+        "Overridden in all cells of bpql: width=8.",
+    ]
 
 
 def test_names_run_no_script(opened: Any) -> None:

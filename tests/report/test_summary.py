@@ -331,7 +331,9 @@ def test_overrides_of_a_task_do_not_part_an_agent() -> None:
     summary = summarise(every, cells)
     assert summary.labels == ["bpql", "bpql critic_norm=layer", "vdpo"]
     assert summary.shared == {("bpql", "Hopper-v4"): {"steps": 200}, ("vdpo", "Hopper-v4"): {"steps": 200}}
-    assert "Overridden in all cells of bpql, vdpo on Hopper-v4: steps=200." in markdown(summary, "t", {})
+    line = "Overridden in all cells of bpql, vdpo on Hopper-v4: steps=200."
+    assert line in markdown(summary, "t", {})
+    assert payload(summary, "t")["remarks"] == [line]
     (met,) = [c for c in summary.comparisons if (c.one, c.other) == ("bpql", "vdpo")]
     assert met.tasks == 2
 

@@ -126,7 +126,8 @@ def _report(grid: Grid | None, given: argparse.Namespace) -> None:
         folder, name, cells = given.runs, grid.name, standing(grid.cells, given.runs)
         rows, versions = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
         configs = configs_of(grid.cells, given.runs)
-    page = report(rows, cells, given.out or folder / f"{name}-report", name, versions, configs)
+    description = grid.description if grid else ""
+    page = report(rows, cells, given.out or folder / f"{name}-report", name, versions, configs, description)
     done = sum(progress.state == "done" for _, progress in cells)
     print(f"{name}: {done} of {len(cells)} cells are done\nopen {page}; the same as Markdown is beside it")
 

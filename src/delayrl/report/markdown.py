@@ -17,11 +17,21 @@ Pictures = Mapping[tuple[Setting, str], list[str]]
 GREY = '<span style="color:#888">{}</span>'
 
 
-def markdown(summary: Summary, title: str, pictures: Pictures, versions: Sequence[Mapping[str, Any]] = ()) -> str:
+def markdown(
+    summary: Summary,
+    title: str,
+    pictures: Pictures,
+    versions: Sequence[Mapping[str, Any]] = (),
+    description: str = "",
+) -> str:
     """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
     legend = "† acts on the true state while it trains. ± is the standard deviation over seeds."
-    parts = [f"# {_escape(title)}", f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip()]
-    parts += [_escape(line) for line in wording.remarks(summary, versions)]
+    parts = [
+        f"# {_escape(title)}",
+        _escape(description),
+        f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip(),
+    ]
+    parts += [_escape(line) for line in (*wording.remarks(summary), *wording.made_with(versions))]
     for setting in summary.settings:
         results = [r for r in summary.results.values() if r.place.setting == setting]
         protocol, preset = _escape(setting.protocol), _escape(setting.preset)

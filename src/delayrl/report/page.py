@@ -24,19 +24,21 @@ from delayrl.report.tables import Table
 Names = dict[str, list[Any]]  # the data holds indices into these lists
 
 
-def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> str:
+def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = (), description: str = "") -> str:
     """Write the page: the template with title and data, and a policy that allows its own script alone."""
     template = resources.files("delayrl.report").joinpath("report.html").read_text("utf-8")
     script = template.split("<script>")[1].split("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    data = json.dumps(payload(summary, title, versions), separators=(",", ":"), allow_nan=False)
+    data = json.dumps(payload(summary, title, versions, description), separators=(",", ":"), allow_nan=False)
     for sign in "<>&\u2028\u2029":  # none of them can end the data's element, or begin another
         data = data.replace(sign, f"\\u{ord(sign):04x}")
     values = {"title": html.escape(title), "digest": digest, "data": data}
     return re.sub(r"\{\{(title|digest|data)\}\}", lambda match: values[match[1]], template)
 
 
-def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
+def payload(
+    summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = (), description: str = ""
+) -> dict[str, Any]:
     """Return what the page draws: plain lists, numbers and texts."""
     results = list(summary.results.values())
     anchored: dict[tuple[Setting, str, int], Result] = {}
@@ -52,7 +54,8 @@ def payload(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] 
         "title": title,
         "state": wording.states(summary),
         "counts": Counter(r.progress.state for r in results),
-        "notes": wording.remarks(summary, versions),
+        "remarks": [*filter(None, [description]), *wording.remarks(summary)],
+        "notes": wording.made_with(versions),
         "paper": wording.paper(summary).replace("`", ""),
         "settings": [s._asdict() | {"seeds": seeds[s]} for s in settings],
         "tasks": tasks,

@@ -19,6 +19,7 @@ def report(
     title: str = "delayrl",
     versions: Sequence[Mapping[str, Any]] = (),
     configs: Iterable[Mapping[str, Any]] = (),
+    description: str = "",
 ) -> Path:
     """Write report.md, report.html and img/*.png, and return the path of the page.
 
@@ -29,6 +30,7 @@ def report(
         title: the heading.
         versions: libraries, commit and hardware that made the rows, as in a run's configuration.
         configs: as for `summarise`; may be empty.
+        description: what stands below the heading, such as that of a grid.
 
     Raises:
         DelayRLError: damaged or double rows, nothing to show, a folder that cannot be written.
@@ -38,9 +40,9 @@ def report(
         raise DelayRLError("there is nothing to report: no cells and no rows")
     try:
         pictures = figures.draw(summary, out / "img")
-        text = markdown(summary, title, pictures, versions)
+        text = markdown(summary, title, pictures, versions, description)
         (out / "report.md").write_text(text, encoding="utf-8", errors="replace")
-        text = page(summary, title, versions)
+        text = page(summary, title, versions, description)
         (out / "report.html").write_text(text, encoding="utf-8", errors="replace")
     except OSError as error:
         raise DelayRLError(f"the report cannot be written to {out}: {error.strerror or error}") from error

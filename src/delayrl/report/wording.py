@@ -245,8 +245,8 @@ def overrides(summary: Summary) -> list[str]:
     ]
 
 
-def remarks(summary: Summary, versions: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Write what must be known of all results: rows left out, tasks that changed, overrides, machines and libraries."""
+def remarks(summary: Summary) -> list[str]:
+    """Write what must be known of all results: rows left out, tasks that changed, overrides."""
     line = f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out."
     left_out = [line] if summary.unplaced else []
     changed = [
@@ -254,7 +254,7 @@ def remarks(summary: Summary, versions: Sequence[Mapping[str, Any]]) -> list[str
         "tasks stand together."
         for env in summary.changed
     ]
-    return left_out + changed + overrides(summary) + made_with(versions)
+    return left_out + changed + overrides(summary)
 
 
 def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:
