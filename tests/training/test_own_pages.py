@@ -16,7 +16,7 @@ from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
 from delayrl.play.run import Run
 from own_tasks import write_module
-from short_runs import declare
+from short_runs import declare, train
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -80,3 +80,15 @@ def test_the_blocks(site: Path) -> None:
     for block in [*others, *laws]:
         exec(block.replace("steps=3000", "steps=1100, evaluation_episodes=2"), {})
     assert {path.parent.name for path in Path("runs").glob("*/*/*")} == {"late-ddpg-small", "Here-small", "bpql-small"}
+
+
+@pytest.mark.thorough
+def test_the_agent_on_top_of_sac(tmp_path: Path, monkeypatch) -> None:
+    """Without its weight it is BPQL, to the last bit; with it another agent."""
+    page = (DOCS / "own-agent.md").read_text()
+    write_module(tmp_path, "smooth", next(block for block in blocks(page, "python") if "# smooth.py" in block))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    ways = {"bpql": {}, "smooth:ENTRY": {}, "smooth:Smooth": {"smoothness": 0.0}}
+    runs = [train(agent, tmp_path / agent, preset="matched", steps=200, **values) for agent, values in ways.items()]
+    returns = [[row["return"] for row in run.rows()] for run in runs]
+    assert returns[0] == returns[2] != returns[1]
