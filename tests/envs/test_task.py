@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
 from gymnasium.spaces import Box
-from gymnasium.wrappers import NormalizeObservation, TimeLimit
+from gymnasium.wrappers import NormalizeObservation, RepeatAction, TimeLimit
 
 import delayrl
 import own_tasks
@@ -18,7 +18,7 @@ from delayrl.envs.making import delay_of, make
 from delayrl.envs.task import Part, Task, as_task, closing, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import resolve
-from delayrl.wrappers.layers import limit_of
+from delayrl.wrappers.layers import limit_of, seconds_of
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
 
 
@@ -378,3 +378,12 @@ def test_rounding_brings_no_action_beyond_its_range() -> None:
         env.reset(seed=0)
         for action in np.linspace(-1, 1, 9, dtype=np.float32):
             env.step(np.full(1, action))
+
+
+def test_a_step_of_repeated_actions_is_longer_and_an_episode_of_them_shorter() -> None:
+    env = gym.make("Pendulum-v1")  # 200 steps of 50 ms
+    for repeats in (1, 3):
+        repeated = RepeatAction(env, num_repeats=repeats)
+        assert seconds_of(repeated) == pytest.approx(0.05 * repeats)
+        assert limit_of(repeated) == -(-200 // repeats)
+    assert limit_of(TimeLimit(RepeatAction(env, num_repeats=3), 40)) == 40

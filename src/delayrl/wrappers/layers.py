@@ -13,6 +13,8 @@ from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, DelayWarning
 
 _warned: set[str] = set()
+REPEATS = {"RepeatAction": "num_repeats", "MaxAndSkipObservation": "_skip"}
+"""Gymnasium's wrappers of which a step is several steps of what they wrap, and where they keep how many."""
 
 
 def name_of(env: Any) -> str:
@@ -22,10 +24,12 @@ def name_of(env: Any) -> str:
 
 def seconds_of(env: Any) -> float | None:
     """Return the length of a step in seconds: the `dt` of the outermost layer that has one, or the task's `tau`."""
-    layers = list(layers_of(env))
-    for seconds in [*(getattr(layer, "dt", None) for layer in layers), getattr(layers[-1], "tau", None)]:
-        if isinstance(seconds, int | float | np.number) and seconds > 0:
-            return float(seconds)
+    steps = 1
+    for layer in layers_of(env):
+        for seconds in (getattr(layer, "dt", None), getattr(layer, "tau", None) if layer is env.unwrapped else None):
+            if isinstance(seconds, int | float | np.number) and seconds > 0:
+                return float(seconds) * steps
+        steps *= _steps_in(layer)
     return None
 
 
@@ -35,6 +39,11 @@ def layers_of(env: Any) -> Iterator[Any]:
     while isinstance(env, gym.Wrapper):
         env = env.env
         yield env
+
+
+def _steps_in(layer: Any) -> int:
+    """Return how many steps of what it wraps are one step of a layer."""
+    return int(getattr(layer, REPEATS.get(type(layer).__name__, ""), 1))
 
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
@@ -51,7 +60,11 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
 
 def limit_of(env: Any) -> int | None:
     """Return the time limit of an environment in steps, the least of its spec's and its layers'; None without one."""
-    limits = [layer._max_episode_steps for layer in layers_of(env) if isinstance(layer, TimeLimit)]
+    steps, limits = 1, []
+    for layer in layers_of(env):
+        if isinstance(layer, TimeLimit):
+            limits.append(-(-layer._max_episode_steps // steps))
+        steps *= _steps_in(layer)
     if env.spec is not None and env.spec.max_episode_steps is not None:
         limits.append(env.spec.max_episode_steps)
     return min(map(int, limits), default=None)
