@@ -278,11 +278,12 @@ def test_a_run_that_went_on_is_not_of_its_cell(finished, tmp_path: Path) -> None
     grid, runs = finished
     cell = replace(grid.cells[0], id="6789")
     run, source = (RunFolder(runs / c.folder / "seed0") for c in (cell, grid.cells[0]))
-    run.create({k: v for k, v in source.config.items() if k != "format"})
-    run.append("rows", [row | {"step": row["step"] + cell.condition.steps} for row in source.read("rows")])
+    config = {k: v for k, v in source.config.items() if k != "format"}
+    run.create(config | {"schedule": config["schedule"] | {"steps": 2 * cell.condition.steps}})
+    run.append("rows", source.read("rows"))
     alone = Grid("alone", "", Path("alone.toml"), (cell,))
     for what in (lambda: collect(alone, runs, tmp_path / "t.sqlite"), lambda: list(rows_of([cell], runs))):
-        with pytest.raises(delayrl.DelayRLError, match=r"was trained up to step .*, and its cell ends at"):
+        with pytest.raises(delayrl.DelayRLError, match=r"was trained for .* steps, and its cell for "):
             what()
     assert list(tmp_path.iterdir()) == []
 

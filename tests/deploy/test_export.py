@@ -3,7 +3,7 @@
 import json
 import sys
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import pytest
 from bundles import bundle_of, policy_of, run_of
 
 from delayrl import DelayWarning, evaluate, load, make
+from delayrl.agents.registry import AGENTS
 from delayrl.agents.sac import SAC
 from delayrl.cli.main import main
 from delayrl.deploy import Controller, export_run, load_bundle
@@ -316,3 +317,10 @@ def test_a_network_that_does_not_give_the_agents_actions_is_not_written(tmp_path
         export_run(source, tmp_path / "bundle", agent=gentle)
     assert not (tmp_path / "bundle").exists()
     export_run(source, tmp_path / "bundle", agent=SAC(actor_sees="augmented", critic_sees="current"))
+
+
+def test_an_agent_that_samples_in_evaluation_is_exported_by_its_mode(tmp_path: Path) -> None:
+    source = run_of(tmp_path / "run", "ad-sac").path
+    agent = replace(AGENTS["ad-sac"].presets["small"].agent, evaluation="sample")
+    export_run(source, tmp_path / "bundle", agent=agent)
+    assert load_bundle(tmp_path / "bundle").metadata["agent"] == "ad-sac"

@@ -1,6 +1,5 @@
 """Agents of a user are trained, resumed, evaluated, loaded and exported; in grids and from the command line too."""
 
-import inspect
 import json
 import sys
 import warnings
@@ -24,7 +23,7 @@ from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.play.run import Run
 from delayrl.play.video import watch
-from delayrl.run.agents import TAKEN, as_agent, find_agent, known_agents
+from delayrl.run.agents import as_agent, find_agent, known_agents
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.condition import overrides_of, resolve
 from own_agents import Shrink
@@ -82,10 +81,11 @@ def test_code_that_has_changed_is_told(tmp_path: Path, monkeypatch) -> None:
         warnings.simplefilter("error")
         evaluate(run.path, 1)
         train("edited:Shrink", tmp_path / "run")
-    write_module(tmp_path, "edited", text + "# another line\n")
-    for what in (lambda: evaluate(run.path, 1), lambda: train("edited:Shrink", tmp_path / "run")):
-        with pytest.warns(DelayWarning, match="the code of edited:Shrink has changed since .*run was trained"):
-            what()
+    for line in ("# one line\n", "# another\n"):
+        write_module(tmp_path, "edited", text + line)
+        for what in (lambda: evaluate(run.path, 1), lambda: train("edited:Shrink", tmp_path / "run")):
+            with pytest.warns(DelayWarning, match="the code of edited:Shrink has changed since .*run was trained"):
+                what()
 
 
 def test_a_run_is_played_by_the_agent_of_its_length(tmp_path: Path) -> None:
@@ -256,7 +256,6 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
         ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
         ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
         ("own_agents:Steps", "has an option steps, as every run has"),
-        ("own_agents:Progress", "has an option progress, as every run has"),
         ("own_agents:Wordy", "name must be a number; got 'me'"),
         ("not_there:Agent", "cannot import 'not_there': ModuleNotFoundError"),
         ("os:system", "os:system is no agent"),
@@ -268,16 +267,14 @@ def test_what_is_no_agent(name: str, words: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_an_option_of_the_command_is_refused(capsys) -> None:
+@pytest.mark.parametrize("name", ["quiet", "progress"])
+def test_an_option_of_the_command_is_refused(name: str, capsys) -> None:
+    """Also a parameter of `train`. In Python an instance may have it, and its runs are read."""
     with pytest.raises(SystemExit):
-        main(["train", "own_agents:Quiet", "--env", "Reacher-v5"])
-    line = "delayrl: the agent has an option --quiet, as the command has: give it another name\n"
+        main(["train", f"own_agents:{name.title()}", "--env", "Reacher-v5"])
+    line = f"delayrl: the agent has an option --{name}, as the command has: give it another name\n"
     assert capsys.readouterr().err == line
-
-
-def test_names_that_no_option_can_have() -> None:
-    parameters = inspect.signature(delayrl.train).parameters.values()
-    assert list(TAKEN) == [one.name for one in parameters if one.kind is not one.VAR_KEYWORD]
+    assert find_agent(f"own_agents:{name.title()}").presets
 
 
 def test_an_option_with_a_percent_sign(capsys) -> None:

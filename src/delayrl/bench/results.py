@@ -49,9 +49,10 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 
 def _own_rows(cell: Cell, path: Path) -> list[Row]:
     """Return the rows of a cell's run. Raises DelayRLError if it was trained further than the cell."""
-    rows = name_configuration(RunFolder(path).read("rows"))
-    if (last := max((row["step"] for row in rows), default=0)) > cell.condition.steps:
-        line = f"{path} was trained up to step {last:,}, and its cell ends at {cell.condition.steps:,}"
+    run, steps = RunFolder(path), cell.condition.steps
+    rows = name_configuration(run.read("rows"))
+    if rows and (trained := run.config["schedule"]["steps"]) != steps:
+        line = f"{path} was trained for {trained:,} steps, and its cell for {steps:,}"
         raise DelayRLError(f"{line}: move it out of that folder, and run the cell again")
     return rows
 

@@ -59,6 +59,10 @@ def add_stored(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--agent", metavar="MODULE:NAME", help="the agent (default: what the run names)")
 
 
+DEEPEST = 500
+"""Opening brackets in the value of a keyword argument, which may all lie in one another."""
+
+
 def pair(word: str) -> tuple[str, Any]:
     """Return name and value of a word such as `gain=2`. Raises DelayRLError if it is none.
 
@@ -67,13 +71,11 @@ def pair(word: str) -> tuple[str, Any]:
     name, equals, text = word.partition("=")
     if not name.isidentifier() or not equals:
         raise DelayRLError(f"keyword arguments are written NAME=VALUE, e.g. gain=2; got {word!r}")
+    if sum(map(text.count, "[{(")) > DEEPEST:  # Python's readers differ in what they do then
+        raise DelayRLError(f"the value of {name} is nested too deeply")
     for read in (json.loads, ast.literal_eval):
-        try:
+        with suppress(ValueError, SyntaxError, TypeError):
             return name, read(text)
-        except (ValueError, SyntaxError, TypeError):
-            continue
-        except (RecursionError, MemoryError) as error:
-            raise DelayRLError(f"the value of {name} is nested too deeply") from error
     return name, text
 
 

@@ -60,9 +60,12 @@ class OwnLaw:
         if self.law is None:
             raise DelayRLError(f"{self.text} has no name that it could be imported by: give it again, as delay")
         drawn: Any = self.law.draw(state, random)
-        if not isinstance(drawn, tuple) or len(drawn) != 2:
-            raise DelayRLError(f"{self.text} drew {drawn!r:.80}, not a travel time and the next state: {PAGE}")
-        travel, state = whole_steps(drawn[0]) + self.later, drawn[1]
+        try:
+            travel, state = drawn
+        except (TypeError, ValueError) as error:
+            line = f"{self.text} drew {drawn!r:.80}, not a travel time and the next state: {PAGE}"
+            raise DelayRLError(line) from error
+        travel = whole_steps(travel) + self.later
         if travel > self.maximum:
             longest = self.maximum - self.later
             raise DelayRLError(f"{self.text} drew {travel - self.later} steps, and its maximum is {longest}")

@@ -51,7 +51,10 @@ def export_run(
     def act(obs: NDArray[Any], actions: NDArray[Any], age: int) -> NDArray[np.float32]:
         return policy.act(obs, {"age": age, "actions": actions})
 
-    check_same(network, arrays, act, f"{config['agent']}: its `deterministic` does not give the actions of its `act`")
+    first = np.zeros(network.obs_size), np.zeros((network.max_age, network.action_size)), 0
+    if np.array_equal(act(*first), act(*first)):  # else it samples in evaluation, and its network gives the mode
+        otherwise = f"{config['agent']}: its `deterministic` does not give the actions of its `act`"
+        check_same(network, arrays, act, otherwise)
     write_files(Path(out), pack(network, arrays, metadata), force=force)
     return metadata
 

@@ -75,7 +75,7 @@ class Estimated:
         10th to the 90th percentile of windows that differ, for a sensor with the period of the loop. The law is of each
         episode, or of each message if ages vary within one.
         """
-        (low, high), period = np.array(self.span) / self.period, float(self.method != "stamps")  # theirs includes it
+        (low, high), period = np.array(self.span) / self.period, float(self.method != "stamps")  # theirs include it
         return self._law(*any_phase(low, high, period), self._varies)
 
     @property
@@ -93,7 +93,7 @@ class Estimated:
     @property
     def _varies(self) -> bool:
         """Whether ages vary within an episode: by more than a sensor's phase or an estimate's scatter explains."""
-        # by correlation the span has a row more, and a part is known to a row
+        # by correlation `span` has one row more, and the delay of a part is known to one row
         alike = min(self.row, self.period) if self.method == "stamps" else 2 * self.row
         return self.span[1] - self.span[0] > alike + TOLERANCE * self.period
 

@@ -28,11 +28,6 @@ AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
 PARTS = ("privileged", "ahead", "phases", "init", "act", "deterministic")
 """What the protocol `Agent` asks for."""
-TAKEN = (
-    "agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device",
-    "overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress",
-)  # fmt: skip
-"""Parameters of `delayrl.train`: an option with one of these names could not be given."""
 
 
 class Named(NamedTuple):
@@ -182,7 +177,7 @@ def _checked(thing: Any, name: str) -> Agent:
     with one_line(f"the types of the fields of agent {name} cannot be read"):
         own = list(options(agent))
     for option in own:
-        if option.name in {*values_of(Schedule()), *TAKEN}:
+        if option.name in values_of(Schedule()):
             raise DelayRLError(f"agent {name} has an option {option.name}, as every run has: give it another name")
         option.check(option.default)
     return agent  # type: ignore[no-any-return]

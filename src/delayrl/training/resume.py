@@ -77,7 +77,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
         run.rewind(newest.step)
         if complete:
             run.finish(slim=group.ways.slim or not checkpoint.can_go_on)
-        elif used not in (known := versions_in(run.config)):
+        elif [used] != (known := versions_in(run.config))[-1:]:
             run.create(run.config | {"later_versions": [*known[1:], used]})
     return state
 
@@ -166,7 +166,8 @@ def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) ->
             columns[name][i] = loop[name]
         actor = actors[i]
         actor.replay_episode(int(loop["episode"]), loop["actions"])
-        if not np.array_equal(actor.truth, loop["truth"]) or actor.total != loop.get("total", actor.total):
+        total = loop.get("total", actor.total)  # as exact as the observations, which are in single precision
+        if not np.array_equal(actor.truth, loop["truth"]) or not np.isclose(actor.total, total, 1e-5, 1e-5):
             env = group.setup.condition.env
             raise DelayRLError(f"{env} does not repeat an episode from its seed, so the run cannot be resumed")
     replay = ring.Replay(**{name: jnp.asarray(columns.pop(name)) for name in ring.Replay._fields})

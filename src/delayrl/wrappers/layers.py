@@ -43,7 +43,8 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 def _steps_in(layer: Any) -> int:
     """Return how many steps of what it wraps are one step of a layer."""
-    return int(getattr(layer, REPEATS.get(type(layer).__name__, ""), 1))
+    kept = next((REPEATS[kind.__name__] for kind in type(layer).__mro__ if kind.__name__ in REPEATS), "")
+    return int(getattr(layer, kept, 1))
 
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
