@@ -363,10 +363,12 @@ def main() -> None:
         arms, goals = ladder.sections(rows, images / "ladder.png")
         insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
         insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
-    if (ages := HERE / "results" / "halfcheetah-ages.jsonl").exists():
-        title = "HalfCheetah-v5, trained under uniform:1:25, five seeds"
-        sweeps.draw(sweeps.read(ages), title, images / "ages.png", COLOURS)
-        insert(root / "docs" / "algorithms" / "any-age.md", "ages", sweeps.section(ages, "any-age"))
+    usual, every = (HERE / "results" / f"halfcheetah-ages{name}.jsonl" for name in ("", "-any"))
+    title, wide = "HalfCheetah-v5, trained under uniform:1:25, five seeds", "any-age second_age=any"
+    played = sweeps.read(usual) | {wide: sweeps.read(every)["any-age"]}
+    sweeps.draw(played, title, images / "ages.png", COLOURS | {wide: "#1b7f79"})
+    for name, file in {"ages": usual, "ages-any": every}.items():
+        insert(root / "docs" / "algorithms" / "any-age.md", name, sweeps.section(file, "any-age"))
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]
     insert(root / "docs" / "algorithms" / "any-age.md", "against", against.section(rows))
     poles = against.section(rows, "InvertedDoublePendulum-v5")
