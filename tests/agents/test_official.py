@@ -141,6 +141,7 @@ def test_openings(agent: str, kind: str, length: int, tmp_path: Path, monkeypatc
     monkeypatch.setattr(type(AGENTS[agent].presets["small"].agent), "phases", lambda self: ())  # nothing is learned
     monkeypatch.setattr(delayrl.Delayed, "step", spy)
     monkeypatch.setattr(Actor, "start_episode", note)
+    monkeypatch.setattr("delayrl.training.train.check_repeats", lambda setup: None)  # it plays a few steps, too
     values = {"random_steps": 50, "steps": 210, "replay_capacity": 1000}
     values |= {"hidden": [7, 7]}  # of an agent that no other test compiles
     train(agent, tmp_path / "run", protocol="official", **values)
