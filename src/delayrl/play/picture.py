@@ -74,7 +74,8 @@ def render(env: Any) -> Picture:
     picture = np.asarray(env.render())
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape) < 2:
         alone = picture.dtype == object and picture.ndim == 0
-        gave = type(picture.item()).__name__ if alone else f"{picture.dtype} {list(picture.shape)}"
+        kind = type(picture.item()).__name__.removesuffix("Type") if alone else ""  # None for NoneType
+        gave = kind or f"{picture.dtype} {list(picture.shape)}"
         what = "an array of uint8 [height, width, 3 or 4], of 2 pixels or more each way"
         raise DelayRLError(f"the render() of {name_of(env)} must return {what}; it returned {gave}")
     return picture
