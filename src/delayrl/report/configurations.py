@@ -29,10 +29,9 @@ def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise DelayRLError(f"{path} cannot be read: {error}") from error
         for config in configs:
-            if not isinstance(config, dict):
-                raise DelayRLError(f"{path} has a configuration that is no object")
-            check_more(config, f"a configuration in {path}")
-        yield from configs
+            if isinstance(config, dict):  # others are refused with the number of their line, as rows are
+                check_more(config, f"a configuration in {path}")
+                yield config
 
 
 def by_key(configs: Iterable[Config]) -> dict[Key, Config]:
