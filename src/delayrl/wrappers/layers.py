@@ -24,12 +24,10 @@ def name_of(env: Any) -> str:
 
 def seconds_of(env: Any) -> float | None:
     """Return the length of a step in seconds: the `dt` of the outermost layer that has one, or the task's `tau`."""
-    steps = 1
-    for layer in layers_of(env):
+    for layer, steps in _layers_with_steps(env):
         for seconds in (getattr(layer, "dt", None), getattr(layer, "tau", None) if layer is env.unwrapped else None):
             if isinstance(seconds, int | float | np.number) and seconds > 0:
                 return float(seconds) * steps
-        steps *= _steps_in(layer)
     return None
 
 
@@ -41,10 +39,13 @@ def layers_of(env: Any) -> Iterator[Any]:
         yield env
 
 
-def _steps_in(layer: Any) -> int:
-    """Return how many steps of what it wraps are one step of a layer."""
-    kept = next((REPEATS[kind.__name__] for kind in type(layer).__mro__ if kind.__name__ in REPEATS), "")
-    return int(getattr(layer, kept, 1))
+def _layers_with_steps(env: Any) -> Iterator[tuple[Any, int]]:
+    """Yield each layer, and how many of its steps are one step of the environment."""
+    steps = 1
+    for layer in layers_of(env):
+        yield layer, steps
+        kept = next((REPEATS[kind.__name__] for kind in type(layer).__mro__ if kind.__name__ in REPEATS), "")
+        steps *= int(getattr(layer, kept, 1))
 
 
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
@@ -61,11 +62,10 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
 
 def limit_of(env: Any) -> int | None:
     """Return the time limit of an environment in steps, the least of its spec's and its layers'; None without one."""
-    steps, limits = 1, []
-    for layer in layers_of(env):
+    limits = []
+    for layer, steps in _layers_with_steps(env):
         if isinstance(layer, TimeLimit):
             limits.append(-(-layer._max_episode_steps // steps))
-        steps *= _steps_in(layer)
     if env.spec is not None and env.spec.max_episode_steps is not None:
         limits.append(env.spec.max_episode_steps)
     return min(map(int, limits), default=None)
