@@ -48,3 +48,8 @@ def name_configuration(rows: Sequence[Row]) -> list[Row]:
     """Give all rows of a run the configuration that its last row names: an older version may have begun the run."""
     newest = rows[-1].get(CONFIGURATION) if rows else None
     return [row if newest is None else {CONFIGURATION: newest} | row for row in rows]
+
+
+def drawable(text: str) -> str:
+    """Return a text of a row as pictures can draw it: no formula between two $, no lone surrogates."""
+    return text.encode("utf-8", "replace").decode().replace("$", r"\$")
