@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.run.rows import drawable, whole_evaluations
+from delayrl.run.rows import plain_text, whole_evaluations
 
 COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
 
@@ -27,7 +27,7 @@ def curve(rows: list[dict[str, Any]], path: Path) -> None:
             label = f"{first['agent']}, delay {first['delay']}" if policy == "agent" else "its reference, no delay"
             steps = whole_evaluations(points)
             _band(axes, steps, [points[step] for step in steps], COLOURS[policy], label)
-        axes.set(xlabel="environment steps", ylabel="return", title=drawable(f"{first['env']}, seed {first['seed']}"))
+        axes.set(xlabel="environment steps", ylabel="return", title=plain_text(f"{first['env']}, seed {first['seed']}"))
         axes.legend(frameon=False)
 
 
@@ -36,7 +36,7 @@ def against_delay(results: list[dict[str, Any]], path: Path) -> None:
     first = results[0]
     with _axes(path) as axes:
         _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOURS["agent"], first["agent"])
-        title = drawable(f"{first['env']}, one policy, {first['episodes']} episodes a point")
+        title = plain_text(f"{first['env']}, one policy, {first['episodes']} episodes a point")
         axes.set(xlabel="delay of the observations (steps)", ylabel="return", title=title)
 
 
@@ -45,12 +45,12 @@ def curves(groups: Sequence[tuple[str, NDArray[Any], NDArray[Any]]], path: Path,
     with _axes(path) as axes:
         for number, (label, steps, returns) in enumerate(groups):
             _band(axes, list(steps), list(returns.T), f"C{number}", label)
-        axes.set(xlabel="environment steps", ylabel="return, mean and range of the seeds", title=drawable(title))
+        axes.set(xlabel="environment steps", ylabel="return, mean and range of the seeds", title=plain_text(title))
         axes.legend(frameon=False)
 
 
 def _band(axes: Any, x: Sequence[float], values: Sequence[Any], colour: str, label: str) -> None:
-    axes.plot(x, [np.mean(v) for v in values], color=colour, label=drawable(label), marker="o", markersize=3)
+    axes.plot(x, [np.mean(v) for v in values], color=colour, label=plain_text(label), marker="o", markersize=3)
     low, high = [np.min(v) for v in values], [np.max(v) for v in values]
     axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
 

@@ -12,7 +12,7 @@ import numpy as np
 from delayrl.report.results import Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
 from delayrl.report.summary import THRESHOLDS, Aggregate, Summary
-from delayrl.run.rows import drawable
+from delayrl.run.rows import plain_text
 
 STYLES = {
     "vdpo": ("#2b63b5", "#7aaeff", ""),
@@ -121,7 +121,7 @@ def _drawn(text: str, letters: int = NAME) -> str:
     What tells two names apart may stand anywhere in them, so that only very long ones are cut, in the middle.
     """
     text = text if len(text) <= 400 else f"{text[:200]} … {text[-200:]}"
-    return drawable(textwrap.fill(text, letters, break_on_hyphens=False))
+    return plain_text(textwrap.fill(text, letters, break_on_hyphens=False))
 
 
 def _anchor_lines(axes: Any, results: Sequence[Result]) -> None:

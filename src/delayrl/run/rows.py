@@ -50,6 +50,6 @@ def name_configuration(rows: Sequence[Row]) -> list[Row]:
     return [row if newest is None else {CONFIGURATION: newest} | row for row in rows]
 
 
-def drawable(text: str) -> str:
+def plain_text(text: str) -> str:
     """Return a text of a row as pictures can draw it: no formula between two $, no lone surrogates."""
     return text.encode("utf-8", "replace").decode().replace("$", r"\$")
