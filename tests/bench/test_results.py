@@ -25,6 +25,7 @@ from delayrl.run.folder import RunFolder
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 MIXED = """
+description = "Two protocols"
 preset = "small"
 seeds = 2
 tasks = ["Reacher-v5"]
@@ -378,7 +379,9 @@ def test_a_table_of_any_name_is_reported(finished, tmp_path: Path, name: str, ca
     main(["bench", "collect", str(grid.source), "--runs", str(runs), "--out", str(file)])
     main(["bench", "report", str(file)])
     assert f"open {tmp_path / 'table-report' / 'report.html'}" in capsys.readouterr().out
-    assert "random" in (tmp_path / "table-report" / "report.md").read_text()
+    text = (tmp_path / "table-report" / "report.md").read_text()
+    assert "random" in text
+    assert grid.description in text
     for text, words in ((b"no table", "no table of results, or damaged"), (None, "there is no table")):
         other = tmp_path / "other.sqlite"
         other.write_bytes(text) if text else other.unlink()

@@ -156,6 +156,13 @@ def cells_done(file: Path) -> int:
         return int(table.execute("SELECT COUNT(*) FROM cells WHERE state = 'done'").fetchone()[0])
 
 
+def description_of(file: Path) -> str:
+    """Return the description of a table's grid, which stands below the heading of its report."""
+    with _open(file) as table:
+        found = table.execute("SELECT value FROM meta WHERE key = 'description'").fetchone()
+        return str(found[0]) if found else ""
+
+
 def _insert_cell(table: sqlite3.Connection, cell: Cell, number: int, p: Progress) -> None:
     values = (cell.id, number, _json(cell.json), p.state, p.step, p.speed)
     table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", values)
