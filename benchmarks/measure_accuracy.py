@@ -18,7 +18,7 @@ import numpy as np
 from delayrl.envs.making import make as make_task
 from delayrl.errors import DelayRLError
 from delayrl.measure import from_log
-from delayrl.measure.reading import read_signals
+from delayrl.measure.reading import Table, read_signals
 from delayrl.report.markdown import markdown_table
 
 HERE = Path(__file__).parent
@@ -109,7 +109,7 @@ def write(path: Path, rows: list[list[float]], commands: int) -> None:
 
 def levels(path: Path) -> float:
     """Return the lag, in rows, at which raw commands and observations correlate most: the naive estimate."""
-    log = read_signals(path)
+    log = read_signals(Table(path))
     u, y = (v - v.mean(0) for v in (log.commands, log.observations))
     u, y = u / u.std(0), y / np.maximum(y.std(0), 1e-12)
     r = [np.abs(u[:-lag].T @ y[lag:]).max() for lag in range(1, LONGEST + 1)]

@@ -25,10 +25,13 @@ OWN = {
     "dida": {"expert_steps": 200, "round_steps": 20, "imitation_updates": 5, "student_hidden": [8]},
     "lifting": {"lifting_hold": 120, "lifting_end": 250},
 }
+SHRINK = "own_agents:Shrink"
+"""Acts, learns, and compiles in a second: for tests of everything but agents."""
+SMALL = ("random", SHRINK)
 
 
 def train(agent: str, out: Path, **values):
-    tiny = TINY | OWN.get(agent, {}) if agent != "random" else {name: TINY[name] for name in list(TINY)[:5]}
+    tiny = TINY | OWN.get(agent, {}) if agent not in SMALL else {name: TINY[name] for name in list(TINY)[:5]}
     options = {
         "env": "Reacher-v5",
         "delay": 0 if agent == "sac" else 3,

@@ -226,9 +226,9 @@ def test_capacity_counts_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_the_habits_are_part_of_a_run(tmp_path: Path) -> None:
     """A run under other habits of the same name, as of an earlier version, is not gone on with."""
-    run = train("bpql", tmp_path / "run", protocol="official", steps=150)
-    assert run.config["habits"]["opening"] == "zeros"
+    run = train("random", tmp_path / "run", protocol="official", steps=150)
+    assert run.config["habits"]["opening"] == "one-random"
     config = (run.path / "config.json").read_text()
-    (run.path / "config.json").write_text(config.replace('"zeros"', '"one-random"'))
+    (run.path / "config.json").write_text(config.replace('"one-random"', '"zeros"'))
     with pytest.raises(delayrl.DelayRLError, match="another opening"):
-        train("bpql", tmp_path / "run", protocol="official", steps=150)
+        train("random", tmp_path / "run", protocol="official", steps=150)

@@ -4,12 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from conftest import TINY, TINY_SAC
-from delayrl.agents.base import Agent, template
-from delayrl.agents.normalised import Moments, NormalisedObservations
+from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import AGENTS as REGISTRY
 from delayrl.core.types import Spec
 from delayrl.deploy.export import network_of
@@ -19,6 +17,7 @@ from delayrl.play.policy import Policy
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.configuration import values_of
 from delayrl.run.folder import RunFolder
+from random_states import random_state
 
 AGENTS = {"sac": TINY_SAC, **TINY}
 AGENTS |= {f"vdpo, {name}": replace(TINY["vdpo"], representation=name) for name in ("transformer-no-belief", "mlp")}
@@ -29,23 +28,6 @@ for name in ("bpql", "vdpo", "any-age"):
 DELAY = 4
 OBS, LOW, HIGH = 10, np.array([-0.4, -2.0], np.float32), np.array([0.4, 3.0], np.float32)
 """Reacher's sizes; a range of actions that is neither symmetric nor the same for all."""
-
-
-def random_state(agent: Agent, spec: Spec, seed: int = 0) -> Any:
-    """A state of the agent's form, with weights so large that actions fill their range."""
-    random = np.random.default_rng(seed)
-
-    def fill(leaf: Any) -> Any:
-        if not np.issubdtype(leaf.dtype, np.floating):
-            return np.zeros(leaf.shape, leaf.dtype)
-        inputs = leaf.shape[0] if len(leaf.shape) > 1 else 16
-        return (1.5 * random.normal(size=leaf.shape) * inputs**-0.5).astype(leaf.dtype)
-
-    state = jax.tree.map(fill, template(agent, spec))
-    if isinstance(agent, NormalisedObservations):
-        mean, squares = random.normal(size=(2, spec.obs_size)).astype(np.float32)
-        state = state._replace(moments=Moments(np.float32(50), mean, 50 * np.abs(squares)))
-    return state
 
 
 def policy_of(name: str, seed: int = 0) -> Policy:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from bundles import AGENTS, bundle_of, policy_of, random_state
+from bundles import AGENTS, bundle_of, policy_of
 
 from delayrl.agents.registry import AGENTS as REGISTRY
 from delayrl.core import networks

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bundles import bundle_of, random_state
+from bundles import bundle_of
 
 from conftest import TINY
 from delayrl.cli.main import main

@@ -25,7 +25,7 @@ from delayrl.play.evaluation import evaluate
 from delayrl.run.condition import resolve
 from delayrl.run.folder import RunFolder
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
-from short_runs import arrays, killed_and_resumed, train
+from short_runs import SHRINK, arrays, killed_and_resumed, train
 
 LENGTH = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
 LENGTH += ["--replay-capacity", "250", "--quiet"]
@@ -110,7 +110,7 @@ def test_environments_are_closed(tmp_path: Path) -> None:
             raise RuntimeError("the port is gone")
 
     held = lambda: gym.wrappers.TimeLimit(Held(), 50)  # noqa: E731
-    run = train("bpql", tmp_path / "run", env=held, seeds=2)[0]
+    run = train(SHRINK, tmp_path / "run", env=held, seeds=2)[0]
     assert not open_now
     evaluate(run, 2, env=held)
     delayrl.load(run, held)
@@ -124,7 +124,7 @@ def test_environments_are_closed(tmp_path: Path) -> None:
         return held()
 
     with pytest.raises(DelayRLError, match="RuntimeError: no third"):
-        train("bpql", tmp_path / "three", env=two_at_most, seeds=3)
+        train(SHRINK, tmp_path / "three", env=two_at_most, seeds=3)
     assert not open_now
     other = train("random", tmp_path / "other", env="Pendulum-v1", steps=200)
     with pytest.raises(DelayRLError, match="the policy takes observations of size 3"):
@@ -135,8 +135,8 @@ def test_environments_are_closed(tmp_path: Path) -> None:
 def test_a_function_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> None:
     """Trained, killed, resumed and evaluated with the same function, it gives what a named one gives."""
     maker = functools.partial(make_arm)
-    run = killed_and_resumed("bpql", tmp_path / "partial", monkeypatch, env=maker, env_kwargs={"gain": 0.5})
-    named = train("bpql", tmp_path / "named", env="own_tasks:make_arm(gain=0.5)")
+    run = killed_and_resumed(SHRINK, tmp_path / "partial", monkeypatch, env=maker, env_kwargs={"gain": 0.5})
+    named = train(SHRINK, tmp_path / "named", env="own_tasks:make_arm(gain=0.5)")
     assert (run.config["env"], named.config["env"]) == ("<partial>(gain=0.5)", "own_tasks:make_arm(gain=0.5)")
     for name, array in arrays(named).items():
         np.testing.assert_array_equal(array, arrays(run)[name])
@@ -252,7 +252,7 @@ def test_a_bundle_of_an_own_task(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     from delayrl.deploy import export_run
 
-    run = train("bpql", tmp_path / "run", env=lambda **kwargs: make_arm(**kwargs))
+    run = train(SHRINK, tmp_path / "run", env=lambda **kwargs: make_arm(**kwargs))
     with pytest.raises(DelayRLError, match="<lambda> has no name"):
         export_run(run.path, tmp_path / "bundle")
     metadata = export_run(run.path, tmp_path / "bundle", env=make_arm)
