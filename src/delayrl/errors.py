@@ -13,6 +13,10 @@ class StoppedError(DelayRLError):
     """A run stopped when asked to. Its newest step is stored; the same call resumes it."""
 
 
+STOPPED = 75
+"""Exit status of a stopped run or an unfinished grid, which the same command resumes (EX_TEMPFAIL)."""
+
+
 class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
 

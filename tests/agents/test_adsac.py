@@ -79,7 +79,7 @@ def test_next_value_by_hand() -> None:
     state = state._replace(auxiliary=state.auxiliary._replace(target=constant))
     later = agent.inputs(windows_of(), windows_of().n_step)
     auxiliary_key, augmented_key = jax.random.split(jax.random.key(3))
-    value, entropies = agent.next_value(state, later, auxiliary_key, augmented_key)
+    value, entropies = agent.next_value(state, later, auxiliary_key, augmented_key, 0.0)
     short = networks.sample(TINY.policy(state.auxiliary.actor, later.auxiliary), auxiliary_key)[1]
     long = networks.sample(TINY.policy(state.actor, later.augmented), augmented_key)[1]
     pair = np.stack([3 - 0.5 * np.asarray(short), 5 - 0.2 * np.asarray(long)])
@@ -93,9 +93,9 @@ def test_each_actor_has_its_target_critic() -> None:
     agent, state = started()
     later = agent.inputs(windows_of(), windows_of().n_step)
     keys = jax.random.split(jax.random.key(3))
-    value, _ = agent.next_value(state, later, *keys)
+    value, _ = agent.next_value(state, later, *keys, 0.0)
     swapped = state.auxiliary._replace(target=state.auxiliary.target[::-1])
-    assert not np.allclose(value, agent.next_value(state._replace(auxiliary=swapped), later, *keys)[0])
+    assert not np.allclose(value, agent.next_value(state._replace(auxiliary=swapped), later, *keys, 0.0)[0])
 
 
 def test_critic_loss_by_hand() -> None:
@@ -104,7 +104,7 @@ def test_critic_loss_by_hand() -> None:
     windows = windows_of()
     key = jax.random.key(5)
     auxiliary_key, augmented_key, _ = jax.random.split(key, 3)
-    value, _ = agent.next_value(state, agent.inputs(windows, windows.n_step), auxiliary_key, augmented_key)
+    value, _ = agent.next_value(state, agent.inputs(windows, windows.n_step), auxiliary_key, augmented_key, 0.0)
     y = []
     for i in range(16):
         k = int(windows.n_step[i])
@@ -128,7 +128,7 @@ def test_equal_delays_are_a_sac() -> None:
     target_key, actor_key = jax.random.split(key)
     policy_key, temperature_key = jax.random.split(jax.random.split(actor_key, 1)[0])
     now, later = agent.inputs(windows, 0), agent.inputs(windows, windows.n_step)
-    value, entropies = agent.next_value(state, later, target_key, target_key)
+    value, entropies = agent.next_value(state, later, target_key, target_key, 0.0)
     auxiliary, of_critic = agent.learner.learn_critic(state.auxiliary, windows, now.auxiliary, value)
     state = state._replace(auxiliary=auxiliary)
     assert same((of_critic["critic_loss"], entropies["entropy"]), (metrics["critic_loss"], metrics["entropy"]))

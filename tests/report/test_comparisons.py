@@ -41,7 +41,7 @@ def test_interval_agrees_with_a_bootstrap_written_out() -> None:
         np.mean([s.probability_of_improvement(random.choice(x, x.size), random.choice(y, y.size)) for x, y in pairs])
         for _ in range(20_000)
     ]
-    found = s.improvement_interval(pairs, repetitions=20_000)
+    found = s.improvement_interval(pairs)
     np.testing.assert_allclose(found, np.percentile(drawn, s.expanded_percentiles([6, 5, 6, 5])), atol=0.02)
 
 

@@ -76,14 +76,14 @@ def test_bootstrap_agrees_with_every_possible_resample() -> None:
         for a in itertools.product(strata[0], repeat=3)
         for b in itertools.product(strata[1], repeat=3)
     ]
-    low, high = s.stratified_bootstrap(sure(*strata), s.interquartile_mean, repetitions=40_000)
+    low, high = s.stratified_bootstrap(sure(*strata), s.interquartile_mean)
     exact = np.percentile(every, s.expanded_percentiles([3, 3]))
     np.testing.assert_allclose([low, high], exact, atol=0.3)
 
 
 def test_bootstrap_agrees_with_scipy() -> None:
     scores = np.random.default_rng(1).normal(size=30)
-    low, high = s.stratified_bootstrap(sure(scores), s.interquartile_mean, repetitions=20_000)
+    low, high = s.stratified_bootstrap(sure(scores), s.interquartile_mean)
     reference = stats.bootstrap(
         (scores,),
         lambda x, axis: s.interquartile_mean(x),
@@ -106,7 +106,7 @@ def test_anchors_are_resampled_with_the_runs() -> None:
     returns, random, reference = np.array([40.0, 70.0]), np.array([0.0, 10.0]), np.array([90.0, 130.0])
     twice = [list(itertools.product(x, repeat=2)) for x in (returns, random, reference)]
     every = [(np.mean(x) - np.mean(r)) / (np.mean(df) - np.mean(r)) for x, r, df in itertools.product(*twice)]
-    low, high = s.stratified_bootstrap([s.Stratum(random, reference, [returns])], mean, repetitions=40_000)
+    low, high = s.stratified_bootstrap([s.Stratum(random, reference, [returns])], mean)
     np.testing.assert_allclose([low, high], np.percentile(every, s.expanded_percentiles([2])), atol=0.02)
 
 
@@ -125,14 +125,15 @@ def test_no_interval_where_the_reference_may_be_worse_than_random() -> None:
 
 
 @pytest.mark.parametrize("runs", [5, 25])
-def test_bootstrap_covers_as_often_as_it_says(runs: int) -> None:
+def test_bootstrap_covers_as_often_as_it_says(runs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain percentile interval of five runs covers a mean 84 times in 100."""
+    monkeypatch.setattr(s, "REPETITIONS", 2000)
     random = np.random.default_rng(0)
     hits = {2: 0, 1: 0}
-    for trial in range(400):
+    for _ in range(400):
         both = sure(random.normal(size=runs), random.normal(3, 1, runs))
         for tasks, middle in ((2, 1.5), (1, 0)):
-            low, high = s.stratified_bootstrap(both[:tasks], mean, 2000, trial)
+            low, high = s.stratified_bootstrap(both[:tasks], mean)
             hits[tasks] += low <= middle <= high
     for found in hits.values():
         assert 0.90 <= found / 400 <= 0.98
@@ -148,14 +149,15 @@ def test_percentiles_of_few_runs_are_expanded() -> None:
     assert s.expanded_percentiles([5, 5])[0] > 4 * low  # two conditions know more of the spread than one
 
 
-def test_bootstrap_covers_a_normalised_mean_only_with_the_anchors_uncertainty() -> None:
+def test_bootstrap_covers_a_normalised_mean_only_with_the_anchors_uncertainty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Agent and reference are equal, so that the true value is 1, and the reference is as uncertain as the agent."""
+    monkeypatch.setattr(s, "REPETITIONS", 400)
     random = np.random.default_rng(0)
     hits = {"resampled": 0, "taken as exact": 0}
-    for trial in range(200):
+    for _ in range(200):
         returns, reference = random.normal(10, 2, 25), random.normal(10, 2, 25)
         for name, anchor in (("resampled", reference), ("taken as exact", np.full(25, reference.mean()))):
-            low, high = s.stratified_bootstrap([s.Stratum(np.zeros(2), anchor, [returns])], mean, 400, trial)
+            low, high = s.stratified_bootstrap([s.Stratum(np.zeros(2), anchor, [returns])], mean)
             hits[name] += low <= 1 <= high
     assert 0.88 <= hits["resampled"] / 200 <= 0.99
     assert hits["taken as exact"] / 200 < 0.88
@@ -175,7 +177,7 @@ def test_interval_of_steps_agrees_with_every_possible_resample() -> None:
         for a in itertools.product(range(3), repeat=3)
         for b in itertools.product(reference, repeat=2)
     )
-    assert s.bootstrap_steps(steps, curves, reference, 40_000) == (every[0], every[-1])  # of 108; all, with three runs
+    assert s.bootstrap_steps(steps, curves, reference) == (every[0], every[-1])  # of 108; all, with three runs
     assert every[0] == 20
     assert every[-1] == math.inf
     assert s.bootstrap_steps(steps, curves + 100, reference) == (10, 10)

@@ -44,7 +44,7 @@ def test_rows_name_a_long_delay_shortly() -> None:
     condition = resolve("bpql", "Pendulum-v1", delay, "small", "corrected", {}).condition
     assert condition.delay == delay
     assert len(str(condition.columns["delay"])) < 30
-    assert Condition(**(condition.json | {"delay": condition.label})).label == condition.label
+    assert Condition(**(condition.json | {"delay": condition.short_delay})).short_delay == condition.short_delay
 
 
 def test_protocols_are_values() -> None:

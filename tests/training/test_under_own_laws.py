@@ -42,7 +42,7 @@ def test_a_named_law(tmp_path: Path) -> None:
     (cell,) = load_grid(file).cells
     assert cell.condition.delay == BURST
     assert cell.id == resolve("bpql", "Pendulum-v1", Burst(0.3), "paper", "corrected", {}).cell_id([0])
-    assert cell.condition.place == "Pendulum-v1-delayown_laws:Burst(length=2, rate=0.3, steps=3"
+    assert cell.condition.folder_name == "Pendulum-v1-delayown_laws:Burst(length=2, rate=0.3, steps=3"
 
 
 def test_a_law_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> None:

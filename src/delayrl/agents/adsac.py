@@ -131,7 +131,7 @@ class ADSAC:
         return state, metrics | entropies | temperatures
 
     def next_value(
-        self, state: State, later: Inputs, auxiliary_key: Key, augmented_key: Key, log_scale: float = 0.0
+        self, state: State, later: Inputs, auxiliary_key: Key, augmented_key: Key, log_scale: float
     ) -> tuple[Float[Array, " batch"], Metrics]:
         """Return V(x^τ_{t+k}), the minimum over two pairs of actor and target critic, and the actors' entropies.
 

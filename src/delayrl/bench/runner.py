@@ -24,8 +24,6 @@ PAUSE = 0.2
 """Seconds between two looks at the workers."""
 RETRY = 2.0
 """Seconds until a cell that another process holds is looked at again; tries in vain wait a multiple of it."""
-STOPPED = 75
-"""Exit status of an unfinished grid that the same command resumes (EX_TEMPFAIL)."""
 
 
 class Backend(Protocol):

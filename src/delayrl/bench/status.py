@@ -79,7 +79,7 @@ def table(standing: Standing) -> list[list[str]]:
     rows = []
     for cell, p in standing:
         condition, first, last = cell.condition, cell.seeds[0], cell.seeds[-1]
-        names = [cell.id, condition.agent, condition.env, str(condition.label)]
+        names = [cell.id, condition.agent, condition.env, str(condition.short_delay)]
         seeds, steps = f"{first}-{last}" if last > first else str(first), f"{p.step:,} / {condition.steps:,}"
         left = seconds_left([(cell, p)], 1)
         times = [f"{p.speed:.0f}" if p.speed else "", duration(left) if left else ""]

@@ -11,7 +11,7 @@ from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
 from delayrl.bench.status import HEAD, closing_lines, duration, line, progress, standing, table
 from delayrl.cli.console import StatusLine, print_table, whole
-from delayrl.errors import DelayRLError
+from delayrl.errors import STOPPED, DelayRLError
 from delayrl.run.cell import Cell
 from delayrl.training.signals import stop_signal
 
@@ -134,7 +134,7 @@ def _report(grid: Grid | None, given: argparse.Namespace) -> None:
 
 
 def _run(grid: Grid, given: argparse.Namespace) -> None:
-    from delayrl.bench.runner import STOPPED, run_cells
+    from delayrl.bench.runner import run_cells
 
     _check_backend(given)
     cells = _chosen(grid, given.cells)

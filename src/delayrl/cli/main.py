@@ -9,7 +9,7 @@ from typing import Any
 
 from delayrl import __version__
 from delayrl.cli.console import Parser
-from delayrl.errors import DelayRLError, DelayWarning, StoppedError, needs_extra
+from delayrl.errors import STOPPED, DelayRLError, DelayWarning, StoppedError, needs_extra
 
 COMMANDS = {
     "train": "train an agent, or resume a run",
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _run(list(sys.argv[1:] if arguments is None else arguments))
     except DelayRLError as error:
         print(f"delayrl: {error}", file=sys.stderr)
-        sys.exit(75 if isinstance(error, StoppedError) else 2)
+        sys.exit(STOPPED if isinstance(error, StoppedError) else 2)
     except ModuleNotFoundError as error:
         if (needed := needs_extra(error)) is None:
             raise

@@ -199,7 +199,7 @@ def make_results(
     for cell, progress in sorted(standing, key=lambda item: item[0].id):
         condition = cell.condition
         setting = Setting(condition.protocol, condition.preset)
-        place = Place(setting, condition.env, condition.label, labels[cell.id])
+        place = Place(setting, condition.env, condition.short_delay, labels[cell.id])
         if any(set(other.seeds) & set(cell.seeds) for other, _ in members[place]):  # the same seeds again
             place = place._replace(label=f"{place.label} #{cell.id[:8]}")
         members[place].append((cell, progress))

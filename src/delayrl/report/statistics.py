@@ -75,31 +75,25 @@ def interquartile_mean(scores: ArrayLike) -> Floats:
     return x[..., cut : x.shape[-1] - cut].mean(-1)
 
 
-def stratified_bootstrap(
-    strata: Sequence[Stratum], statistic: Callable[[Floats], Floats], repetitions: int = REPETITIONS, seed: int = 0
-) -> tuple[Floats, Floats]:
+def stratified_bootstrap(strata: Sequence[Stratum], statistic: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
     """Estimate the 95 % interval of a statistic of pooled scores.
 
     Resamples runs within their condition, and the runs of the anchors, whose means then normalise all conditions of
-    their stratum.
+    their stratum. The same returns always give the same interval.
 
     Args:
         strata: one for each task, with at least one run in each of its arrays.
-        statistic: of scores [repetitions, runs], along the last axis; returns [repetitions, ...].
-        repetitions: how many resamples.
-        seed: the same returns and seed give the same interval.
+        statistic: of scores [REPETITIONS, runs], along the last axis; returns [REPETITIONS, ...].
 
     Returns:
         Lower and upper bound. NaN where a condition or an anchor has fewer than two runs, because their spread is then
         unknown, and where the reference is no better than random in a resample.
     """
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     scores, known = [], True
     for stratum in strata:
-        low, high = (_resample(random, x, repetitions).mean(1, keepdims=True) for x in stratum[:2])
-        scores += [
-            (_resample(random, x, repetitions) - low) / np.where(high > low, high - low, 1) for x in stratum.returns
-        ]
+        low, high = (_resample(random, x).mean(1, keepdims=True) for x in stratum[:2])
+        scores += [(_resample(random, x) - low) / np.where(high > low, high - low, 1) for x in stratum.returns]
         sizes = [x.size for x in (stratum.random, stratum.reference, *stratum.returns)]
         known = known and min(sizes) > 1 and bool((high > low).all())
     percentiles = expanded_percentiles([x.size for stratum in strata for x in stratum.returns])
@@ -112,21 +106,18 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
     x = np.asarray(values, float)
     if x.size < 2:
         return NAN, NAN
-    means = _resample(np.random.default_rng(0), x, REPETITIONS).mean(1)
+    means = _resample(np.random.default_rng(0), x).mean(1)
     low, high = np.percentile(means, expanded_percentiles([x.size]))
     return float(low), float(high)
 
 
-def bootstrap_steps(
-    steps: ArrayLike, curves: Floats, reference: Floats, repetitions: int = REPETITIONS
-) -> tuple[float, float]:
+def bootstrap_steps(steps: ArrayLike, curves: Floats, reference: Floats) -> tuple[float, float]:
     """Estimate the 95 % interval of the step at which the mean of curves reaches the mean of a reference.
 
     Args:
         steps: of the evaluations, [N].
         curves: [runs, N], resampled by runs.
         reference: returns of the reference's runs, [seeds], resampled too.
-        repetitions: how many resamples; the same curves always give the same interval.
 
     Returns:
         Lower and upper bound, each one of the steps, or infinite where the curve does not reach the reference. NaN with
@@ -135,8 +126,8 @@ def bootstrap_steps(
     if min(len(curves), len(reference)) < 2:
         return NAN, NAN
     random = np.random.default_rng(0)
-    means = _resample(random, curves, repetitions).mean(1)
-    thresholds = _resample(random, reference, repetitions).mean(1, keepdims=True)
+    means = _resample(random, curves).mean(1)
+    thresholds = _resample(random, reference).mean(1, keepdims=True)
     reached = np.nan_to_num(steps_to_threshold(steps, means, thresholds), nan=math.inf)
     # a method that interpolates nothing
     low, high = np.percentile(reached, expanded_percentiles([len(curves)]), method="inverted_cdf")
@@ -149,12 +140,11 @@ def probability_of_improvement(one: ArrayLike, other: ArrayLike) -> Floats:
     return (1 + np.sign(x[..., :, None] - y[..., None, :]).mean((-1, -2))) / 2
 
 
-def improvement_interval(pairs: Sequence[tuple[Floats, Floats]], repetitions: int = REPETITIONS) -> tuple[float, float]:
+def improvement_interval(pairs: Sequence[tuple[Floats, Floats]]) -> tuple[float, float]:
     """Estimate the 95 % interval of the mean probability of improvement over tasks.
 
     Args:
         pairs: final returns of two agents, [n] and [m], for each task; runs are resampled within their agent and task.
-        repetitions: how many resamples.
 
     Returns:
         Lower and upper bound; NaN with fewer than FEWEST runs of either on a task.
@@ -162,7 +152,7 @@ def improvement_interval(pairs: Sequence[tuple[Floats, Floats]], repetitions: in
     if min(x.size for pair in pairs for x in pair) < FEWEST:
         return NAN, NAN
     random = np.random.default_rng(0)
-    resampled = [[_resample(random, x, repetitions) for x in pair] for pair in pairs]
+    resampled = [[_resample(random, x) for x in pair] for pair in pairs]
     means = np.mean([probability_of_improvement(*pair) for pair in resampled], axis=0)
     low, high = np.percentile(means, expanded_percentiles([x.size for pair in pairs for x in pair]))
     return float(low), float(high)
@@ -180,9 +170,9 @@ def expanded_percentiles(sizes: Sequence[int]) -> tuple[float, float]:
     return tail, 100 - tail
 
 
-def _resample(random: np.random.Generator, values: Floats, repetitions: int) -> Floats:
-    """Draw as many of the values, along the first axis, as there are, with replacement: [repetitions, ...]."""
-    return values[random.integers(len(values), size=(repetitions, len(values)))]
+def _resample(random: np.random.Generator, values: Floats) -> Floats:
+    """Draw as many of the values, along the first axis, as there are, with replacement: [REPETITIONS, ...]."""
+    return values[random.integers(len(values), size=(REPETITIONS, len(values)))]
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:

@@ -23,7 +23,7 @@ class Cell:
     def folder(self) -> str:
         """The name of its folder: readable, and unique."""
         condition = self.condition
-        return re.sub(r"[^\w.-]+", "-", f"{condition.place}-{condition.agent}-{self.id}")
+        return re.sub(r"[^\w.-]+", "-", f"{condition.folder_name}-{condition.agent}-{self.id}")
 
     @property
     def json(self) -> dict[str, Any]:

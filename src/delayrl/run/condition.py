@@ -40,19 +40,19 @@ class Condition:
     steps: int = 0  # environment steps that each seed trains; 0 where that is unknown
 
     @property
-    def label(self) -> int | str:
+    def short_delay(self) -> int | str:
         """The delay as rows name it: long lists of numbers are shortened."""
         return short_label(self.delay)
 
     @property
-    def place(self) -> str:
+    def folder_name(self) -> str:
         """The task and the delay as folders are named by them: without brackets at the ends, and not too long."""
-        return f"{self.env.strip('<>() ')[:100]}-delay{str(self.label).strip('<>() ')}"
+        return f"{self.env.strip('<>() ')[:100]}-delay{str(self.short_delay).strip('<>() ')}"
 
     @property
     def columns(self) -> dict[str, Any]:
         """What every row says of its condition."""
-        return {name: getattr(self, name) for name in CONDITION} | {"delay": self.label}
+        return {name: getattr(self, name) for name in CONDITION} | {"delay": self.short_delay}
 
     @property
     def json(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class Condition:
         return cls(**{name: values[name] for name in KINDS})
 
     def __str__(self) -> str:
-        return f"{self.agent} on {self.env}, delay {self.label}"
+        return f"{self.agent} on {self.env}, delay {self.short_delay}"
 
 
 @dataclass(frozen=True)

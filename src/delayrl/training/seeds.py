@@ -37,7 +37,7 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
     kind = f"{condition.agent.strip('<>')}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"
-    task, kind = (re.sub(r"[^\w.=+@-]+", "-", name) for name in (condition.place, kind))
+    task, kind = (re.sub(r"[^\w.=+@-]+", "-", name) for name in (condition.folder_name, kind))
     home = Path(out) if out is not None else Path("runs") / task / kind
     if out is not None and len(seeds) == 1:
         return [RunFolder(home)]

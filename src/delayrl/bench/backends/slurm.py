@@ -14,8 +14,8 @@ from pathlib import Path
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid
-from delayrl.bench.runner import GRACE, STOPPED
-from delayrl.errors import DelayRLError
+from delayrl.bench.runner import GRACE
+from delayrl.errors import STOPPED, DelayRLError
 from delayrl.run.cell import Cell
 from delayrl.run.disk import disk_errors
 
