@@ -7,22 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from learners import same, sampled
 
 from conftest import record
 from delayrl.agents.adsac import ADSAC, State, augmented_learner, with_augmented
 from delayrl.agents.sac import SAC
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.errors import DelayRLError
 
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)
 TINY = SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16)
-
-
-def same(a, b) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def near(a, b) -> None:
@@ -32,12 +28,7 @@ def near(a, b) -> None:
 
 @functools.cache
 def windows_of(env: str = ENV, spec: Spec = SPEC, batch: int = 16) -> Window:
-    replay = ring.init(spec, 300)
-    append = jax.jit(ring.append)
-    for transition in record(env, spec.delay, 150)[0]:
-        replay = append(replay, transition)
-    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
-    return sample(replay, jax.random.key(0), batch, spec.delay, 3, jnp.int32(0))
+    return sampled(record(env, spec.delay, 150)[0], spec, batch, 3)
 
 
 @functools.cache

@@ -296,12 +296,6 @@ def test_act() -> None:
         AGENT.init(Spec(10, 2, 0), jax.random.key(0))
 
 
-def test_defaults_are_the_released_codes() -> None:
-    assert (DCAC().batch_size, DCAC().learning_rate, DCAC().hidden) == (128, 3e-4, (256, 256))
-    assert (DCAC().reward_scale, DCAC().entropy_scale, DCAC().actor_share) == (5.0, 1.0, 0.2)
-    assert (DCAC().discount, DCAC().target_rate, DCAC().log_std_range) == (0.99, 5e-3, (-20.0, 2.0))
-
-
 @pytest.mark.parametrize("delay", ["uniform:1:4", "uniform:1:4@raw", "gilbert:1:4:0.3:0.3@fifo"])
 def test_a_stretch_counts_what_arrived_in_it(delay: str) -> None:
     """Rewards from the first look's state to the last one's, each once, also where a look goes back in time."""

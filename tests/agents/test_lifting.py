@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from learners import same, sampled
 from scipy import integrate, stats
 
 from conftest import record
@@ -15,7 +16,6 @@ from delayrl.agents.base import Schedule
 from delayrl.agents.lifting import Lifting, lifting_loss, moments
 from delayrl.agents.sac import BPQL
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.networks import Gaussian
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import look
@@ -26,18 +26,9 @@ SPEC = Spec(OBS, ACT, DELAY)
 TINY = Lifting(dataclasses.replace(BPQL, hidden=(16, 16), batch_size=16, update_every=4, updates=2))
 
 
-def same(a, b) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-
-
 @functools.cache
 def windows() -> Window:
-    replay = ring.init(SPEC, 300)
-    append = jax.jit(ring.append)
-    for transition in record(ENV, DELAY, 100)[0]:
-        replay = append(replay, transition)
-    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
-    return sample(replay, jax.random.key(0), 16, DELAY, 1, jnp.int32(0))
+    return sampled(record(ENV, DELAY, 100)[0], SPEC, 16, 1)
 
 
 def augmented(batch: Window):
