@@ -1,7 +1,7 @@
 """Agents such as users bring: a class, an instance that its class does not make again, and presets of their own."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +91,38 @@ class Percent(Shrink):
 @dataclass(frozen=True)
 class Wordy(Shrink):
     name: Annotated[str, "neither a number nor one of some words"] = "me"
+
+
+@dataclass(frozen=True)
+class Twice(Shrink):
+    inner: Shrink = Shrink(factor=0.9)  # one name sets both
+
+
+@dataclass(frozen=True)
+class Spoiled(Shrink):
+    """Does one thing that a run could not store, restore or log."""
+
+    how: Annotated[
+        Literal["type", "shape", "more", "key", "names", "step", "metric", "none", "act", "every"], "what"
+    ] = "type"
+
+    def phases(self):
+        return (super().phases()[0]._replace(every=0 if self.how == "every" else 50, update=self.update),)
+
+    def init(self, spec, key):
+        state = super().init(spec, key)
+        more = {"key": jax.random.key(0), "names": {"a.b": jnp.zeros(1), "a": {"b": jnp.zeros(1)}}}
+        return state._replace(updates=more.get(self.how, state.updates))
+
+    def update(self, state, windows, key, count):
+        new, metrics = state, {"lead": windows.lead.mean()}
+        spoiled = {"type": count, "shape": jnp.zeros(2), "more": {"a": jnp.zeros(())}}
+        logged = {"step": {"step": 0.5 * metrics["lead"]}, "metric": {"rewards": windows.reward.mean(0)}, "none": None}
+        return new._replace(updates=spoiled.get(self.how, new.updates)), logged.get(self.how, metrics)
+
+    def act(self, state, seen, key, *, explore):
+        action = super().act(state, seen, key, explore=explore)
+        return action[None] if self.how == "act" else action
 
 
 @dataclass

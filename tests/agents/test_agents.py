@@ -16,7 +16,7 @@ from delayrl.agents.random import Random
 from delayrl.agents.registry import AGENTS
 from delayrl.core import views
 from delayrl.core.types import Seen, Spec, Window
-from delayrl.core.views import look
+from delayrl.core.views import look, network_input
 from delayrl.errors import DelayRLError
 from delayrl.training.learner import AS_ONE, Learner, Stored
 from random_states import random_state
@@ -173,8 +173,24 @@ def test_a_view_that_is_none_and_one_beyond_the_window() -> None:
     flags, ages = rows > 0, rows.astype(int)
     window = Window(rows[:, None], ages, rows[:, None], rows, flags, flags, count, count, delay=3)
     assert look(window, "current", 2).shape == (1,)
-    with pytest.raises(DelayRLError, match="windows reach 2 steps after t, as the agent's `ahead` says; got ahead=3"):
+    with pytest.raises(
+        DelayRLError, match="windows reach 0 to 2 steps after t, as `ahead` of the agent says; got ahead=3"
+    ):
         look(window, "augmented", 3)
+    with pytest.raises(DelayRLError, match="got ahead=-1"):
+        look(window, "augmented", -1)
+    with pytest.raises(DelayRLError, match="the windows are of a delay of 3 steps; got delay=4"):
+        unchecked["view"](window, age=jnp.int32(4), delay=4)
+
+
+def test_the_current_state_is_the_truth_or_unknown() -> None:
+    """Under a delay, what an actor is shown is not what a network that sees `current` learns from."""
+    shown = Seen(jnp.ones(2), jnp.int32(2), jnp.ones((3, 1)))
+    np.testing.assert_array_equal(network_input(shown._replace(truth=jnp.full(2, 9.0)), "current"), [9, 9])
+    with pytest.raises(DelayRLError, match="the current state is not known under a delay"):
+        network_input(shown, "current")
+    no_delay = Seen(jnp.ones(2), jnp.int32(0), jnp.ones((0, 1)))
+    np.testing.assert_array_equal(network_input(no_delay, "current"), [1, 1])
 
 
 def test_random_is_uniform() -> None:

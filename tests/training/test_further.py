@@ -25,7 +25,7 @@ from delayrl.run.arrays import Arrays, flatten_tree
 from delayrl.run.folder import versions_in
 from delayrl.training.origin import RENAMED, _renamed, fitting, parts_of, taken_over
 from random_states import random_state
-from short_runs import arrays, newest, train
+from short_runs import SHRINK, arrays, newest, train
 
 module = import_module("delayrl.training.train")  # `delayrl.training` may show its function under that name
 
@@ -217,6 +217,20 @@ def test_a_run_from_another_goes_on_although_that_one_was_trained_further(tmp_pa
             train("bpql", tmp_path / "new", steps=200, start_from=other)
     again = train("bpql", tmp_path / "new", steps=200, start_from=old, overwrite=True)
     assert again.config["origin"]["from"]["step"] == 300
+
+
+def test_a_run_whose_source_is_gone_is_told_how_to_go_on(tmp_path: Path) -> None:
+    train("random", tmp_path / "plain", steps=200)
+    with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder[^;]*$"):
+        train("random", tmp_path / "plain", steps=200, start_from=tmp_path / "nowhere")
+    old = train(SHRINK, tmp_path / "old", steps=200)
+    train(SHRINK, tmp_path / "new", steps=200, start_from=old, callback=lambda step, runs: True)
+    shutil.rmtree(old.path)
+    with pytest.raises(
+        delayrl.DelayRLError, match=r"old is not .*goes on without it: `delayrl train .*new --steps 200`"
+    ):
+        train(SHRINK, tmp_path / "new", steps=200, start_from=old.path)
+    assert delayrl.go_on(tmp_path / "new", 200, progress=False).rows()[-1]["step"] == 200
 
 
 def test_a_run_goes_on_although_the_newest_checkpoint_of_its_source_is_damaged(tmp_path: Path) -> None:

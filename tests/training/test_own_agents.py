@@ -3,7 +3,7 @@
 import json
 import sys
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -256,6 +256,7 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
         ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
         ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
         ("own_agents:Steps", "has an option steps, as every run has"),
+        ("own_agents:Twice", "has two options factor with different values, and one name sets both"),
         ("own_agents:Wordy", "name must be a number; got 'me'"),
         ("not_there:Agent", "cannot import 'not_there': ModuleNotFoundError"),
         ("os:system", "os:system is no agent"),
@@ -265,6 +266,42 @@ def test_what_is_no_agent(name: str, words: str) -> None:
     with pytest.raises(DelayRLError, match=words) as error:
         find_agent(name)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("type", r"keeps the types of its state: updates was float32\[\], and is int32\[\]"),
+        ("shape", r"updates was float32\[\], and is float32\[2\]"),
+        ("more", "with the arrays of its init; not so updates"),
+        ("key", "holds a random key, updates: store jax.random.key_data of it"),
+        ("names", r"two arrays of the agent's state would be stored as updates.a.b"),
+        ("step", "names of their own; got step, which every run has"),
+        ("metric", r"are single numbers .* got rewards, of shape \(5,\)"),
+        ("none", "returns the new state and a dict of metrics"),
+        ("act", r"act returns an action of shape \(1,\); got \(1, 1\)"),
+        ("every", "every of an agent's phase are at least 1"),
+    ],
+)
+def test_what_a_run_could_not_keep_is_refused_before_it(how: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(DelayRLError, match=words):
+        train(own_agents.Spoiled(how=how), tmp_path / "run")  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+
+
+def test_two_agents_without_a_name_are_two_runs(tmp_path: Path) -> None:
+    """What is no option of theirs tells them apart; the run goes on with either, given by hand."""
+
+    @dataclass(frozen=True)
+    class Local(Shrink):
+        level: float = 0.5
+
+    run = train(Local(level=0.3), tmp_path / "run")
+    assert train(Local(level=0.3), tmp_path / "run").rows() == run.rows()
+    with pytest.raises(DelayRLError, match="holds a run with another agent"):
+        train(Local(level=0.9), tmp_path / "run")
+    longer = delayrl.go_on(run, 300, agent=Local(level=0.3), env=make_arm, progress=False)
+    assert longer.config["unnamed"] == run.config["unnamed"]
 
 
 @pytest.mark.parametrize("name", ["quiet", "progress"])

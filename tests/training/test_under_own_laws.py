@@ -1,10 +1,12 @@
 """Laws of delays of a user are trained under, resumed, evaluated and exported."""
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from delayrl.delays import PerEpisode, as_delay
 from delayrl.deploy import export_run
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import evaluate, sweep
-from delayrl.run.condition import resolve
+from delayrl.run.condition import contents, resolve
 from own_laws import Burst
 from short_runs import SHRINK, arrays, killed_and_resumed, train
 
@@ -79,3 +81,21 @@ def test_a_law_of_ones_own_in_each_episode() -> None:
         drawn.add(travel)
         assert {(law.draw(state, random)[0]) for _ in range(5)} == {travel}
     assert drawn == {1, 4}
+
+
+def test_two_laws_without_a_name_are_two_runs(tmp_path: Path) -> None:
+    """Also within another law, and a changed spec of a task; what no one can compare is taken as it comes."""
+
+    @dataclass(frozen=True)
+    class Local(Burst):
+        pass
+
+    train("random", tmp_path / "law", delay=Local(0.3))
+    assert train("random", tmp_path / "law", delay=Local(0.3)).config["unnamed"].keys() == {"delay"}
+    with pytest.raises(DelayRLError, match="holds a run with another delay"):
+        train("random", tmp_path / "law", delay=Local(0.9))
+    spec = gym.spec("Pendulum-v1")
+    train("random", tmp_path / "spec", env=dataclasses.replace(spec, max_episode_steps=20))
+    with pytest.raises(DelayRLError, match="holds a run with another env"):
+        train("random", tmp_path / "spec", env=dataclasses.replace(spec, max_episode_steps=60))
+    assert contents(lambda: 0) is contents([object()]) is contents({"a": object()}) is None

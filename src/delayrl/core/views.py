@@ -33,11 +33,15 @@ def view(
         obs [S], age [], actions [delay, A] (oldest first, zeros after the first `age`).
 
     Raises:
-        DelayRLError: a window that does not reach so far ahead.
+        DelayRLError: a window that does not reach so far, ahead or back.
     """
-    if isinstance(ahead, int) and ahead >= (reach := window.obs.shape[0] - window.delay):
-        raise DelayRLError(f"windows reach {reach - 1} steps after t, as the agent's `ahead` says; got ahead={ahead}")
-    delay = window.delay if delay is None else delay
+    reach, delay = window.obs.shape[0] - window.delay, window.delay if delay is None else delay
+    if isinstance(ahead, int) and not 0 <= ahead < reach:
+        raise DelayRLError(
+            f"windows reach 0 to {reach - 1} steps after t, as `ahead` of the agent says; got ahead={ahead}"
+        )
+    if delay > window.delay:
+        raise DelayRLError(f"the windows are of a delay of {window.delay} steps; got delay={delay}")
     now = window.delay + jnp.asarray(ahead, jnp.int32)
     age = jnp.minimum(window.age[now] if age is None else age, delay)
     slots = jnp.arange(delay)
@@ -49,10 +53,17 @@ def network_input(seen: Seen, sees: Sees) -> Float[Array, " input"]:
     """Return `seen` as one vector: the observation alone [S], or with actions and age / Δ [S + Δ·A + 1].
 
     The age distinguishes an empty slot at the start of an episode from a zero action. Without a delay, x_t is s_t.
+    Under a delay an actor that sees `current` reads the truth, which only a privileged agent is shown, in training.
+
+    Raises DelayRLError for a view that there is not, or the current state where it is not shown.
     """
     if sees not in get_args(Sees):
         raise DelayRLError(f"a network sees {', '.join(get_args(Sees))}; got {sees!r}")
     delay = seen.actions.shape[-2]
+    if sees == "current" and delay > 0:
+        if seen.truth is None:
+            raise DelayRLError("the current state is not known under a delay: act on `augmented` or `delayed`")
+        return seen.truth
     if sees != "augmented" or delay == 0:
         return seen.obs
     return jnp.concatenate([seen.obs, seen.actions.reshape(-1), (seen.age / delay)[None]])

@@ -177,6 +177,9 @@ def _checked(thing: Any, name: str) -> Agent:
     with one_line(f"the types of the fields of agent {name} cannot be read"):
         own = list(options(agent))
     for option in own:
+        if any(option.name == other.name and option.default != other.default for other in own):
+            line = f"agent {name} has two options {option.name} with different values, and one name sets both"
+            raise DelayRLError(f"{line}: give one another name, or leave out its Annotated")
         if option.name in values_of(Schedule()):
             raise DelayRLError(f"agent {name} has an option {option.name}, as every run has: give it another name")
         option.check(option.default)

@@ -42,11 +42,20 @@ def inner_range(low: NDArray[Any], high: NDArray[Any]) -> tuple[NDArray[np.float
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """Return the leaves of a pytree by name, in its order: "critic.0.w" for `tree.critic[0]["w"]`."""
+    """Return the leaves of a pytree by name, in its order: "critic.0.w" for `tree.critic[0]["w"]`.
+
+    Raises DelayRLError if two have one name.
+    """
     import jax
 
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    named: dict[str, Any] = {}
+    for path, leaf in leaves:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        if name in named:
+            raise DelayRLError(f"two arrays of the agent's state would be stored as {name}: give one another name")
+        named[name] = leaf
+    return named
 
 
 def flatten_tree(tree: Any) -> Arrays:

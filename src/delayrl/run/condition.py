@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
@@ -81,6 +81,7 @@ class Setup:
     schedule: Schedule
     delay: Delay
     protocol: Protocol
+    unnamed: Mapping[str, str] = field(default_factory=dict)  # checksums of what a run has no name for
     origin: Mapping[str, Any] = field(default_factory=dict)  # what training began from, if not from nothing
 
     @property
@@ -90,8 +91,9 @@ class Setup:
         options = {"hyperparameters": values_of(self.agent), "schedule": values_of(self.schedule)}
         rules = {f.name: value for f in fields(Protocol) if (value := getattr(self.protocol, f.name)) != f.default}
         habits = {name: value for name, value in rules.items() if name not in ("name", "overrides")}
-        origin = {"origin": dict(self.origin)} if self.origin else {}
-        return names | {"privileged": self.agent.privileged} | options | ({"habits": habits} if habits else {}) | origin
+        more = {"habits": habits, "unnamed": dict(self.unnamed), "origin": dict(self.origin)}
+        present = {name: value for name, value in more.items() if value}
+        return names | {"privileged": self.agent.privileged} | options | present
 
     def learnable(self, spec: Spec) -> Learnable:
         """Return which steps of an episode can be sampled under the protocol."""
@@ -154,7 +156,22 @@ def resolve(
         )
     condition = Condition(name, str(task), text, preset, protocol, dict(overrides), schedule.steps)
     made = as_trained(override(base.agent, values), schedule)
-    return Setup(condition, task, made, schedule, parsed, chosen)
+    things = {"agent": (name, base.agent), "env": (str(task), task), "delay": (str(text), parsed)}
+    unnamed = {part: contents(thing) for part, (shown, thing) in things.items() if "<" in shown}
+    return Setup(condition, task, made, schedule, parsed, chosen, {k: _digest(x) for k, x in unnamed.items() if x})
+
+
+def contents(thing: Any) -> Any:
+    """Return what a dataclass holds, as JSON can; None if it cannot, or for anything else that is not plain."""
+    if is_dataclass(thing) and not isinstance(thing, type):
+        inner = {f.name: contents(value) for f in fields(thing) if (value := getattr(thing, f.name)) is not None}
+        return None if None in inner.values() else {"": type(thing).__qualname__, **inner}
+    if isinstance(thing, tuple | list):
+        items = [contents(value) for value in thing if value is not None]
+        return None if None in items else items
+    if isinstance(thing, Mapping):
+        return contents(sorted((str(key), value) for key, value in thing.items() if value is not None))
+    return thing if isinstance(thing, str | int | float) else None
 
 
 def following(name: str, preset: Preset, steps: int) -> dict[str, int]:

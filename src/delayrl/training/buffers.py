@@ -47,7 +47,7 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
 
 def product_bytes(agent: Agent, spec: Spec) -> list[int]:
     """Return for each phase the bytes of the matrix products of one update. Touches no device."""
-    programs = [program for _, program in traced_updates(agent, spec)]
+    programs = [traced.jaxpr.jaxpr for _, traced in traced_updates(agent, spec)]
     results = [[x.aval for product in follow(program)[0] for x in product.equation.outvars] for program in programs]
     return [sum(x.size * x.dtype.itemsize for x in of_phase) for of_phase in results]
 

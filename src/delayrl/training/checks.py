@@ -1,28 +1,35 @@
 """What is refused before anything is stored or deleted, and what a new run is warned of."""
 
+import functools
 import warnings
 from importlib.util import find_spec
 from numbers import Integral
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.agents.base import State, template
+from delayrl.agents.base import Agent, State, template
 from delayrl.core import replay as ring
-from delayrl.core.types import Spec
+from delayrl.core.types import Seen, Spec
 from delayrl.envs.making import make
 from delayrl.envs.task import closing
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.play.policy import spec_of
+from delayrl.run.arrays import named_leaves
 from delayrl.run.condition import Setup
 from delayrl.training.machine import free_memory, uses_accelerator
+from delayrl.training.products import traced_updates
 from delayrl.training.state import Ways
 from delayrl.training.tracking import SERVICES
 from delayrl.wrappers import Delayed
 from delayrl.wrappers.layers import check_limit, name_of
+
+METRICS = ("step", "steps_per_second")
+"""What a run's lines of metrics hold anyway."""
 
 
 def check_ways(ways: Ways) -> None:
@@ -62,6 +69,9 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
+    for phase in agent.phases():
+        if low := [name for name in ("every", "updates", "batch") if getattr(phase, name) < 1]:
+            raise DelayRLError(f"{' and '.join(low)} of an agent's phase are at least 1; got {phase[:3]}")
     firsts = [-(-schedule.first_update // phase.every) * phase.every for phase in agent.phases()]
     if firsts and (last := max(firsts)) > schedule.steps >= min(firsts):
         line = f"a part would learn nothing: its first update is at step {last:,}, and the run ends at step"
@@ -75,7 +85,45 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
     check_limit(env, str(setup.task))
-    return template(agent, spec)
+    _check_act(agent, spec)
+    return _checked_state(agent, spec)
+
+
+def _check_act(agent: Agent, spec: Spec) -> None:
+    """Raise DelayRLError unless the agent's action has the task's size, in training and in evaluation."""
+    shape, number = jax.ShapeDtypeStruct, jax.ShapeDtypeStruct((), jnp.int32)
+    obs, actions = shape((spec.obs_size,), jnp.float32), shape((spec.delay, spec.action_size), jnp.float32)
+    state, key = template(agent, spec), jax.eval_shape(lambda: jax.random.key(0))
+    for explore in (True, False):
+        seen = Seen(obs, number, actions, obs if explore and agent.privileged else None)  # type: ignore[arg-type]
+        action = jax.eval_shape(functools.partial(agent.act, explore=explore), state, seen, key)
+        if action.shape != (spec.action_size,):
+            raise DelayRLError(f"an agent's act returns an action of shape {(spec.action_size,)}; got {action.shape}")
+
+
+def _checked_state(agent: Agent, spec: Spec) -> State:
+    """Return the shapes and types of the agent's state. Raises DelayRLError if a run could not store or restore it."""
+    state = template(agent, spec)
+    leaves = named_leaves(state)
+    for name, leaf in leaves.items():
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            raise DelayRLError(f"the agent's state holds a random key, {name}: store jax.random.key_data of it")
+    for _, traced in traced_updates(agent, spec):
+        returned = traced.out_info
+        if not isinstance(returned, tuple) or len(returned) != 2 or not isinstance(returned[1], dict):
+            raise DelayRLError("an agent's update returns the new state and a dict of metrics")
+        updated, metrics = named_leaves(returned[0]), returned[1]
+        if other := sorted(updated.keys() ^ leaves.keys()):
+            raise DelayRLError(f"an agent's update returns a state with the arrays of its init; not so {other[0]}")
+        for name, leaf in updated.items():
+            if (leaf.shape, leaf.dtype) != (leaves[name].shape, leaves[name].dtype):
+                was, now = (f"{x.dtype}{list(x.shape)}" for x in (leaves[name], leaf))
+                raise DelayRLError(f"an agent's update keeps the types of its state: {name} was {was}, and is {now}")
+        for name, metric in metrics.items():
+            if getattr(metric, "shape", None) != () or name in METRICS:
+                of = f"of shape {metric.shape}" if getattr(metric, "shape", None) != () else "which every run has"
+                raise DelayRLError(f"metrics of an agent are single numbers with names of their own; got {name}, {of}")
+    return state
 
 
 def check_repeats(setup: Setup) -> None:

@@ -32,7 +32,8 @@ def cost_of(agent: Agent, spec: Spec, schedule: Schedule) -> Cost:
     parameters = sum(math.prod(x.shape) for x in trained if jnp.issubdtype(x.dtype, jnp.floating))
     counters = _counters(leaves)
     flops, steps = 0.0, dict.fromkeys(counters.values(), 0.0)
-    for phase, program in traced_updates(agent, spec):
+    for phase, traced in traced_updates(agent, spec):
+        program = traced.jaxpr.jaxpr
         counts = update_counts(phase, schedule.first_update, schedule.steps)
         rate = phase.updates / phase.every
         inputs: list[Value] = [None] * len(program.invars)

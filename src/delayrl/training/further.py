@@ -94,7 +94,7 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
     origin = dict(config.get("origin", {}))
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]
-    setup = replace(setup, origin=origin)
+    setup = replace(setup, origin=origin, unnamed=config.get("unnamed", {}))
     names = {"agent": config["agent"], "env": config["env"]}  # its rows name what it began with
     return replace(setup, condition=replace(setup.condition, **names, overrides=overrides_of(setup.config)))
 

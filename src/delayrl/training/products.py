@@ -59,10 +59,10 @@ SCALAR: dict[str, Callable[..., Any]] = {
 
 @functools.lru_cache(4)  # a run needs the traces several times
 def traced_updates(agent: Agent, spec: Spec) -> list[tuple[Phase, Any]]:
-    """Return each phase with the program of its update for one seed. Touches no device."""
+    """Return each phase with the trace of its update for one seed (`jax.stages.Traced`). Touches no device."""
     shapes = [(phase, update_shapes(phase, agent, spec)) for phase in agent.phases()]
     with jax.default_matmul_precision("float32"):  # in bfloat16 gradients that XLA deletes are written out
-        return [(phase, jax.jit(phase.update).trace(*args).jaxpr.jaxpr) for phase, args in shapes]
+        return [(phase, jax.jit(phase.update).trace(*args)) for phase, args in shapes]
 
 
 def update_shapes(phase: Phase, agent: Agent, spec: Spec) -> tuple[Any, ...]:

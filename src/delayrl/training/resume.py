@@ -126,7 +126,7 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
 def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
     """Raise DelayRLError if a folder holds a run with another configuration."""
     stored = run.config
-    added_later = {**values_of(Schedule()), **OLDER}
+    added_later = {**values_of(Schedule()), **OLDER, **wanted.get("unnamed", {})}
     if stored.get("origin", {}) != wanted.get("origin", {}):
         raise DelayRLError(
             f"{run.path} holds a run that began otherwise: with other networks, or shorter; give another --out, or "

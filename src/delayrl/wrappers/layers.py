@@ -52,8 +52,8 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
     """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
     if not isinstance(observations, Box) or len(observations.shape) != 1:
         got = " ".join(str(observations).split())[:200]
-        hint = "flatten=True (--flatten) turns a Dict or an image into one"
-        raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}: {hint}")
+        hint = ": flatten=True (--flatten) turns a Dict or an image into one" if observations.is_np_flattenable else ""
+        raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}{hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
         raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
     if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
