@@ -120,9 +120,10 @@ def _checked_state(agent: Agent, spec: Spec) -> State:
                 was, now = (f"{x.dtype}{list(x.shape)}" for x in (leaves[name], leaf))
                 raise DelayRLError(f"an agent's update keeps the types of its state: {name} was {was}, and is {now}")
         for name, metric in metrics.items():
-            if getattr(metric, "shape", None) != () or name in METRICS:
-                of = f"of shape {metric.shape}" if getattr(metric, "shape", None) != () else "which every run has"
-                raise DelayRLError(f"metrics of an agent are single numbers with names of their own; got {name}, {of}")
+            shape = getattr(metric, "shape", "none")  # of a nested one
+            if name in METRICS or shape != ():
+                why = "which every run has" if name in METRICS else f"of shape {shape}"
+                raise DelayRLError(f"metrics of an agent are single numbers with names of their own; got {name}, {why}")
     return state
 
 
