@@ -69,7 +69,7 @@ def test_one_network_serves_every_age(representation: str, rng: np.random.Genera
         noisy = what._replace(actions=what.actions.at[age:].set(0.7))
         np.testing.assert_allclose(agent.act(state, noisy, jax.random.key(0), explore=False), action, atol=1e-6)
     what = seen(4, 0, rng)
-    reference = agent.reference.act(state.reference, what, jax.random.key(0), explore=False)
+    reference = agent.reference.act(state.reference, what._replace(truth=what.obs), jax.random.key(0), explore=False)
     np.testing.assert_array_equal(agent.act(state, what, jax.random.key(0), explore=False), reference)
 
 
