@@ -103,11 +103,12 @@ class Spoiled(Shrink):
     """Does one thing that a run could not store, restore or log."""
 
     how: Annotated[
-        Literal["type", "shape", "more", "key", "names", "step", "metric", "none", "act", "every"], "what"
+        Literal["type", "shape", "more", "key", "names", "step", "metric", "none", "act", "every", "phase"], "what"
     ] = "type"
 
     def phases(self):
-        return (super().phases()[0]._replace(every=0 if self.how == "every" else 50, update=self.update),)
+        phase = super().phases()[0]._replace(every=0 if self.how == "every" else 50, update=self.update)
+        return phase if self.how == "phase" else (phase,)
 
     def init(self, spec, key):
         state = super().init(spec, key)

@@ -14,6 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -143,3 +144,16 @@ def one_line(what: str) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:  # a script without a guard may end the process when it is imported
         raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)}")) from error
+
+
+def contents(thing: Any) -> Any:
+    """Return what a dataclass holds, as JSON can; None if it cannot, or for anything else that is not plain."""
+    if is_dataclass(thing) and not isinstance(thing, type):
+        inner = {f.name: contents(value) for f in fields(thing) if (value := getattr(thing, f.name)) is not None}
+        return None if None in inner.values() else {"": type(thing).__qualname__, **inner}
+    if isinstance(thing, tuple | list):
+        items = [contents(value) for value in thing if value is not None]
+        return None if None in items else items
+    if isinstance(thing, Mapping):
+        return contents(sorted((str(key), value) for key, value in thing.items() if value is not None))
+    return thing if isinstance(thing, str | int | float) else None

@@ -173,14 +173,10 @@ def test_a_view_that_is_none_and_one_beyond_the_window() -> None:
     flags, ages = rows > 0, rows.astype(int)
     window = Window(rows[:, None], ages, rows[:, None], rows, flags, flags, count, count, delay=3)
     assert look(window, "current", 2).shape == (1,)
-    with pytest.raises(
-        DelayRLError, match="windows reach 0 to 2 steps after t, as `ahead` of the agent says; got ahead=3"
-    ):
+    with pytest.raises(DelayRLError, match=r"0 to 2 steps after t \(the agent's `ahead`\); got ahead=3"):
         look(window, "augmented", 3)
     with pytest.raises(DelayRLError, match="got ahead=-1"):
         look(window, "augmented", -1)
-    with pytest.raises(DelayRLError, match="the windows are of a delay of 3 steps; got delay=4"):
-        unchecked["view"](window, age=jnp.int32(4), delay=4)
 
 
 def test_the_current_state_is_the_truth_or_unknown() -> None:

@@ -133,7 +133,7 @@ def test_bad_input() -> None:
         (lambda: jax.jit(lambda high: per_episode(0, high).maximum)(3), "no bound: give maximum="),
         (lambda: per_episode([2, 3], [1, 4]), r"low ≤ high; got \[2, 3\] and \[1, 4\]"),
         (lambda: per_episode(-1, 2), "negative"),
-        (lambda: per_episode(1, 2.5), "whole environment steps; got 2.5"),
+        (lambda: per_episode(1, 2.5), "whole environment steps; got 2.5; for a time write 2.5s"),
         (lambda: per_episode([0, 1], [2, 3, 4]), r"one for each environment; got \[0, 1\] and \[2, 3, 4\]"),
         (lambda: per_episode([], []), "one for each environment"),
         (lambda: per_episode([[0, 1]], [[2, 3]]), "one for each environment"),

@@ -428,6 +428,8 @@ def test_a_recorded_delay_is_named_as_in_its_rows(tmp_path: Path, capsys, monkey
     [
         ("plan nosuch", "unknown grid 'nosuch'; give a .toml file, or one of any-age-ladder, evidence-1"),
         ("plan ./nosuch.toml", "there is no grid file nosuch.toml"),
+        ("report .", ". is a folder, and no grid; runs of `delayrl train` are reported by `python -m delayrl.report"),
+        ("plan my.sqlite", "only `delayrl bench report` reads one"),
         ("run smoke --cells 123", "has no cell 123"),
         ("run smoke --workers 0", "--workers must be at least 1"),
         ("run smoke --tries 0", "--tries must be at least 1"),

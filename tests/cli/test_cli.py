@@ -86,6 +86,11 @@ def test_evaluate(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     for more in ([], ["--json"]):
         main(["evaluate", str(unfinished), "--episodes", "1", *more])
         assert "is not finished: this is its policy after 240 of 1,000 steps" in capsys.readouterr().err
+    main(["export", str(unfinished), "--out", str(tmp_path / "a bundle")])
+    out, err = capsys.readouterr()
+    assert f"delayrl latency '{tmp_path}/a bundle'" in out
+    assert "is not finished: this is its policy after 240 of 1,000 steps" in err
+    assert "`delayrl export" in refused(capsys, "latency", str(run))
     assert "does not fit the env given" in refused(capsys, "evaluate", str(run), "--env", "Pendulum-v1")
 
 

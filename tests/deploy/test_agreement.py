@@ -24,6 +24,7 @@ from delayrl.deploy.backends.onnx_policy import onnx_policy
 from delayrl.deploy.export import network_of
 from delayrl.errors import DelayRLError
 from delayrl.play.policy import Policy
+from random_states import random_state
 
 SOURCE = Path(__file__).parents[2] / "examples" / "cpp" / "controller.cpp"
 REPEATS = 5

@@ -20,6 +20,7 @@ from delayrl.core.types import Spec
 from delayrl.deploy.runtime.telemetry import served
 from delayrl.envs.making import delay_of
 from delayrl.play.policy import Policy
+from random_states import random_state
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "robot.md").read_text()

@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -420,7 +421,7 @@ def test_parts_that_differ_by_a_row_do_not_vary(tmp_path: Path) -> None:
     assert (apart.train_with, apart.in_step) == ("uniform:1:4", "uniform:2:3")
 
 
-def test_columns_units_and_recordings(tmp_path: Path) -> None:
+def test_columns_units_and_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     u, y = signals("servo", 3, 1200)
     clock = np.tile(1000 * ROW * np.arange(400), 3)  # three recordings, in ms
     path = write(
@@ -431,6 +432,13 @@ def test_columns_units_and_recordings(tmp_path: Path) -> None:
     line = r"lie 20 s apart: if its time stamps are not in seconds, say so \(--unit ms\)"
     with pytest.warns(DelayWarning, match=line):
         from_log(path, episode="part", **words)
+    given = ["--time", "clock", "--commands", "wish", "--observations", "angle", "--episode", "part"]
+    with warnings.catch_warnings(action="ignore"):
+        main(["measure", str(path), *given])
+    assert "give --unit" in (shown := capsys.readouterr().out)
+    assert "train with: --delay" not in shown
+    with pytest.raises(DelayRLError, match="--period is a time in seconds; got 40ms"):
+        from_log(path, period="40ms")  # type: ignore[arg-type]
     assert (e.row, e.delay) == (pytest.approx(ROW), pytest.approx(3 * ROW))
     assert (e.peak.command, e.peak.observation) == ("wish", "angle")
     with pytest.raises(DelayRLError, match="row 401: clock goes back"):

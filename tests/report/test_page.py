@@ -216,7 +216,7 @@ def test_page_draws_the_delay_free_line_of_each_length(opened: Any) -> None:
 @pytest.mark.thorough
 def test_page_marks_what_goes_on(opened: Any) -> None:
     view = opened(sampled())
-    states = column(view, "all", 12)
+    states = column(view, "all", 3)
     assert "at 400,000 of 1,000,000 steps" in states
     assert "failed at 200,000 of 1,000,000 steps" in states
     assert "todo" in states

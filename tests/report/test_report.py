@@ -83,7 +83,7 @@ def test_command(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").is_file()
 
 
-@pytest.mark.parametrize("content", ['{"step": 1', "[1]", '{"config": 5}', "\ud800"])
+@pytest.mark.parametrize("content", ['{"step": 1', '{"a": 1}', "[1]", '{"config": 5}', "\ud800"])
 def test_command_of_a_bad_file(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 import delayrl
@@ -120,7 +121,24 @@ def test_a_run_that_began_with_other_networks_is_another(tmp_path: Path) -> None
     assert_refused(tmp_path, "began otherwise", lambda: train("bpql", tmp_path / "new", steps=101))
     assert_refused(tmp_path, "began otherwise", lambda: train("bpql", old.path, steps=101, start_from=tmp_path / "new"))
     delayrl.go_on(old, 103, progress=False)
-    assert_refused(tmp_path, "began otherwise", lambda: train("bpql", old.path, steps=103))
+    assert_refused(tmp_path, "was trained further, to 103 steps", lambda: train("bpql", old.path, steps=103))
+
+
+def test_a_call_that_failed_is_in_nobodys_way(tmp_path: Path) -> None:
+    """Before its first result it left a configuration alone. What has results is kept."""
+
+    def broken() -> gym.Env:
+        env = gym.make("Reacher-v5")
+        env.unwrapped.reset_model = lambda: 1 / 0  # type: ignore[attr-defined]
+        return env
+
+    before = train("random", tmp_path / "before")
+    (tmp_path / "run").mkdir()
+    shutil.copyfile(before.path / "config.json", tmp_path / "run" / "config.json")
+    with pytest.raises(delayrl.DelayRLError, match="ZeroDivisionError"):
+        train("random", tmp_path / "run", env=broken)
+    assert train("random", tmp_path / "run", delay=1).config["delay"] == 1
+    assert_refused(tmp_path, "another delay", lambda: train("random", tmp_path / "run", delay=2))
 
 
 def test_a_run_is_trained_by_one_process(tmp_path: Path) -> None:

@@ -280,6 +280,7 @@ def test_what_is_no_agent(name: str, words: str) -> None:
         ("metric", r"are single numbers .* got rewards, of shape \(5,\)"),
         ("none", "returns the new state and a dict of metrics"),
         ("act", r"act returns an action of shape \(1,\); got \(1, 1\)"),
+        ("phase", r"returns a tuple of Phase; of one, as \(Phase"),
         ("every", "every of an agent's phase are at least 1"),
     ],
 )

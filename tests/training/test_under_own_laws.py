@@ -15,8 +15,9 @@ from delayrl.bench.grid import load_grid
 from delayrl.delays import PerEpisode, as_delay
 from delayrl.deploy import export_run
 from delayrl.errors import DelayRLError
+from delayrl.lookup import contents
 from delayrl.play.evaluation import evaluate, sweep
-from delayrl.run.condition import contents, resolve
+from delayrl.run.condition import resolve
 from own_laws import Burst
 from short_runs import SHRINK, arrays, killed_and_resumed, train
 

@@ -163,3 +163,14 @@ def test_an_episode_in_which_nothing_is_observed(monkeypatch) -> None:
     delayrl.make("Reacher-v5", 48)
     delayrl.make("Reacher-v5", "1+action=48")
     delayrl.make("Reacher-v5", "uniform:1:50")
+
+
+def test_what_is_no_environment_is_refused() -> None:
+    with pytest.raises(
+        delayrl.DelayRLError, match=r"takes an environment; got 'Pendulum-v1': gymnasium.make makes one"
+    ):
+        Delayed("Pendulum-v1", 3)  # type: ignore[arg-type]
+    with pytest.raises(delayrl.DelayRLError, match="DelayedVector takes a vector"):
+        Delayed(gym.make_vec("Pendulum-v1", 2), 3)  # type: ignore[arg-type]
+    with pytest.raises(delayrl.DelayRLError, match=r"got None$"):
+        delayrl.make(gym.Env, 3)

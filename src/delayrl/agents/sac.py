@@ -129,12 +129,7 @@ class SAC:
         return Deterministic(self.actor_sees, state.actor)
 
     def update(
-        self,
-        state: State,
-        windows: Window,
-        key: Key,
-        count: Int[Array, ""],
-        improve_actor: ImproveActor | None = None,
+        self, state: State, windows: Window, key: Key, count: Int[Array, ""], improve_actor: ImproveActor | None = None
     ) -> tuple[State, Metrics]:
         """Update the critics and, every `actor_every`-th time, the actor and the temperature on the same batch.
 

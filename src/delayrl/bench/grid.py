@@ -98,6 +98,11 @@ def _read(grid: str, folder: Path) -> tuple[Path, dict[str, Any]]:
     """Return the file of a grid, and what it holds. A path is relative to the folder."""
     is_path = grid.endswith(".toml") or "/" in grid
     source = folder / grid if is_path else shipped().get(grid)
+    if (folder / grid).is_dir() and (is_path or source is None):
+        hint = f"python -m delayrl.report {grid}/*/*/seed*/rows.jsonl --out report"
+        raise DelayRLError(f"{grid} is a folder, and no grid; runs of `delayrl train` are reported by `{hint}`")
+    if grid.endswith(".sqlite"):
+        raise DelayRLError(f"{grid} is a table of results: only `delayrl bench report` reads one")
     if source is None:
         raise DelayRLError(f"unknown grid {grid!r}; give a .toml file, or one of {', '.join(shipped())}")
     try:

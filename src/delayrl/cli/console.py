@@ -4,10 +4,12 @@ import argparse
 import ast
 import json
 import re
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, NoReturn
 
 from delayrl.errors import DelayRLError, near_names
@@ -159,3 +161,18 @@ class StatusLine:
         """Erase the status from a terminal."""
         if self._terminal:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+
+def say_unfinished(run: Path, step: int | None = None) -> None:
+    """Tell of an unfinished run after how many steps this is its policy; None for those of its newest checkpoint."""
+    from delayrl.run.folder import RunFolder
+
+    folder = RunFolder(run)
+    steps, step = folder.config["schedule"]["steps"], folder.latest().step if step is None else step
+    if step < steps:
+        print(f"delayrl: {run} is not finished: this is its policy after {step:,} of {steps:,} steps", file=sys.stderr)
+
+
+def quoted(path: Path) -> str:
+    """Return a path as a shell takes it."""
+    return shlex.quote(str(path))

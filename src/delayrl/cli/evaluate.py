@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from delayrl.cli.console import add_env_kwargs, add_stored, print_table, whole
+from delayrl.cli.console import add_env_kwargs, add_stored, print_table, say_unfinished, whole
 from delayrl.errors import DelayRLError
 from delayrl.run.rows import return_in_words
 
@@ -39,7 +39,7 @@ def run(given: argparse.Namespace) -> None:
         returns, lowest = result["returns"], f"the lowest {min(result['returns']):.1f}"
         about = f"{result['agent']} on {result['env']}, delay {result['delay']}"
         print(f"{about}: return {return_in_words(returns)}, {lowest}")
-    _say_unfinished(given.run, result["step"])
+    say_unfinished(given.run, result["step"])
 
 
 def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
@@ -63,15 +63,7 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
             numbers = ("" if value is None else f"{value:.1f}" for value in values)
             rows.append([r["delay"], "yes" if r["learned"] else "no", *numbers, r["episodes"]])
         print_table(["delay", "learned", "mean return", "std", "lowest", "episodes"], rows)
-    _say_unfinished(given.run, results[0]["step"])
+    say_unfinished(given.run, results[0]["step"])
     figure = given.run / "delays.png"
     against_delay(results, figure)
     print(f"figure: {figure}", file=sys.stderr)
-
-
-def _say_unfinished(run: Path, step: int) -> None:
-    from delayrl.run.folder import RunFolder
-
-    steps = RunFolder(run).config["schedule"]["steps"]
-    if step < steps:
-        print(f"delayrl: {run} is not finished: this is its policy after {step:,} of {steps:,} steps", file=sys.stderr)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import add_stored
+from delayrl.cli.console import add_stored, quoted, say_unfinished
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -23,4 +23,5 @@ def run(given: argparse.Namespace) -> None:
     shortest, longest = metadata["ages"]
     print(f"{given.out}: {metadata['agent']} on {metadata['env']}, ages {shortest}..{longest}")
     print(f"  serves                   {served(shortest, longest, metadata['action_delay'], metadata['dt'])}")
-    print(f"  next                     delayrl latency {given.out}")
+    print(f"  next                     delayrl latency {quoted(given.out)}")
+    say_unfinished(given.run, metadata["step"])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from delayrl.cli import agents
-from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored, add_wrappers, whole
+from delayrl.cli.console import Numbers, Parser, add_env_kwargs, add_stored, add_wrappers, quoted, whole
 from delayrl.errors import DelayRLError
 from delayrl.play.run import Run
 from delayrl.run.folder import seed_folders
@@ -127,5 +127,5 @@ def _print_summary(run: Run) -> None:
             print(f"  {text:<24} {return_in_words(returns[-1])}")
     print(f"  run folder               {run.path}")
     print(f"  learning curve           {run.path / 'curve.png'}")
-    print(f"  next                     delayrl evaluate {run.path} --episodes 20")
-    print(f"                           delayrl watch {run.path} --out episode.gif")
+    print(f"  next                     delayrl evaluate {quoted(run.path)} --episodes 20")
+    print(f"                           delayrl watch {quoted(run.path)} --out episode.gif")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from delayrl.cli.console import add_env_kwargs, add_stored, whole
+from delayrl.cli.console import add_env_kwargs, add_stored, say_unfinished, whole
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -30,3 +30,5 @@ def run(given: argparse.Namespace) -> None:
     several = "" if given.seconds is None else "episode {0.episode}, "
     results = (several.format(moment) + f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
     print(f"{given.out}: {'; beside it '.join(results)}")
+    for folder in filter(None, (given.run, given.compare)):
+        say_unfinished(folder)

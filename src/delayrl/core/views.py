@@ -15,10 +15,7 @@ Sees = Literal["current", "delayed", "augmented"]
 
 
 def view(
-    window: Window,
-    ahead: int | Int[Array, ""] = 0,
-    delay: int | None = None,
-    age: Int[Array, ""] | None = None,
+    window: Window, ahead: int | Int[Array, ""] = 0, delay: int | None = None, age: Int[Array, ""] | None = None
 ) -> Seen:
     """Return what is visible at step t + `ahead` of the window.
 
@@ -33,15 +30,11 @@ def view(
         obs [S], age [], actions [delay, A] (oldest first, zeros after the first `age`).
 
     Raises:
-        DelayRLError: a window that does not reach so far, ahead or back.
+        DelayRLError: a window that does not reach there.
     """
     reach, delay = window.obs.shape[0] - window.delay, window.delay if delay is None else delay
     if isinstance(ahead, int) and not 0 <= ahead < reach:
-        raise DelayRLError(
-            f"windows reach 0 to {reach - 1} steps after t, as `ahead` of the agent says; got ahead={ahead}"
-        )
-    if delay > window.delay:
-        raise DelayRLError(f"the windows are of a delay of {window.delay} steps; got delay={delay}")
+        raise DelayRLError(f"windows reach 0 to {reach - 1} steps after t (the agent's `ahead`); got ahead={ahead}")
     now = window.delay + jnp.asarray(ahead, jnp.int32)
     age = jnp.minimum(window.age[now] if age is None else age, delay)
     slots = jnp.arange(delay)
@@ -53,19 +46,16 @@ def network_input(seen: Seen, sees: Sees) -> Float[Array, " input"]:
     """Return `seen` as one vector: the observation alone [S], or with actions and age / Δ [S + Δ·A + 1].
 
     The age distinguishes an empty slot at the start of an episode from a zero action. Without a delay, x_t is s_t.
-    Under a delay an actor that sees `current` reads the truth, which only a privileged agent is shown, in training.
-
-    Raises DelayRLError for a view that there is not, or the current state where it is not shown.
+    Under a delay `current` is the truth. Raises DelayRLError where it is not shown, and for a view that there is not.
     """
     if sees not in get_args(Sees):
         raise DelayRLError(f"a network sees {', '.join(get_args(Sees))}; got {sees!r}")
     delay = seen.actions.shape[-2]
-    if sees == "current" and delay > 0:
-        if seen.truth is None:
-            raise DelayRLError("the current state is not known under a delay: act on `augmented` or `delayed`")
-        return seen.truth
+    state = seen.truth if sees == "current" and delay > 0 else seen.obs
+    if state is None:
+        raise DelayRLError("the current state is not known under a delay: act on `augmented` or `delayed`")
     if sees != "augmented" or delay == 0:
-        return seen.obs
+        return state
     return jnp.concatenate([seen.obs, seen.actions.reshape(-1), (seen.age / delay)[None]])
 
 

@@ -42,6 +42,8 @@ def read_files(path: str | Path, wanted: tuple[str, ...]) -> tuple[dict[str, Any
     home = Path(path)
     if not home.is_dir():
         raise DelayRLError(f"{home} is not a policy bundle: it is not a folder")
+    if not (home / DOCUMENT).exists() and (home / "config.json").exists():
+        raise DelayRLError(f"{home} is a run, and no policy bundle: `delayrl export {home} --out DIR` makes one of it")
     document = _read(home / DOCUMENT)
     metadata = _parsed(document, home / DOCUMENT)
     files = metadata.get("files")

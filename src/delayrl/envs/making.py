@@ -61,7 +61,8 @@ def make(
     """
     named = as_task(env, env_kwargs, wrappers, flatten)
     task: Any = _made(named, options)
-    check_spaces(str(named), task.observation_space, task.action_space)
+    spaces: Any = [getattr(task, name, None) for name in ("observation_space", "action_space")]
+    check_spaces(str(named), *spaces)
     if normalise:
         task = NormalizeObservation(task)
     idle = None

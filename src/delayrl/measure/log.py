@@ -159,7 +159,7 @@ def from_log(
     if unit not in reading.UNITS:
         raise DelayRLError(f"time stamps are in {', '.join(reading.UNITS)}; got {unit!r}")
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
-        if value is not None and not (np.isfinite(value) and value >= least):
+        if value is not None and not (isinstance(value, int | float) and np.isfinite(value) and value >= least):
             raise DelayRLError(f"--{name} is a time in seconds; got {value}")
     table = reading.Table(path)
     exact = reading.read_stamps(table, stamp, received, episode, unit)

@@ -132,6 +132,8 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
                             configs[row["run"]] = {name: row["config"][name] for name in names}
                         elif "step" in row:
                             runs[row.get("run")].append(configs.get(row.get("run"), {}) | row)
+                        elif "run" not in row:  # of a run in such a file there may be more
+                            raise KeyError
                     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
                         raise DelayRLError(f"{path}, line {number}: this is no row of results") from None
         except OSError as error:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
@@ -15,6 +15,7 @@ from delayrl.delays import Delay, DelayLike, as_delay, short_label
 from delayrl.envs.making import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
+from delayrl.lookup import contents
 from delayrl.run.agents import AgentLike, as_agent, as_trained, find_agent
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.rows import CONDITION
@@ -92,8 +93,7 @@ class Setup:
         rules = {f.name: value for f in fields(Protocol) if (value := getattr(self.protocol, f.name)) != f.default}
         habits = {name: value for name, value in rules.items() if name not in ("name", "overrides")}
         more = {"habits": habits, "unnamed": dict(self.unnamed), "origin": dict(self.origin)}
-        present = {name: value for name, value in more.items() if value}
-        return names | {"privileged": self.agent.privileged} | options | present
+        return names | {"privileged": self.agent.privileged} | options | {k: v for k, v in more.items() if v}
 
     def learnable(self, spec: Spec) -> Learnable:
         """Return which steps of an episode can be sampled under the protocol."""
@@ -159,19 +159,6 @@ def resolve(
     things = {"agent": (name, base.agent), "env": (str(task), task), "delay": (str(text), parsed)}
     unnamed = {part: contents(thing) for part, (shown, thing) in things.items() if "<" in shown}
     return Setup(condition, task, made, schedule, parsed, chosen, {k: _digest(x) for k, x in unnamed.items() if x})
-
-
-def contents(thing: Any) -> Any:
-    """Return what a dataclass holds, as JSON can; None if it cannot, or for anything else that is not plain."""
-    if is_dataclass(thing) and not isinstance(thing, type):
-        inner = {f.name: contents(value) for f in fields(thing) if (value := getattr(thing, f.name)) is not None}
-        return None if None in inner.values() else {"": type(thing).__qualname__, **inner}
-    if isinstance(thing, tuple | list):
-        items = [contents(value) for value in thing if value is not None]
-        return None if None in items else items
-    if isinstance(thing, Mapping):
-        return contents(sorted((str(key), value) for key, value in thing.items() if value is not None))
-    return thing if isinstance(thing, str | int | float) else None
 
 
 def following(name: str, preset: Preset, steps: int) -> dict[str, int]:

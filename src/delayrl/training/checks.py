@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.agents.base import Agent, State, template
+from delayrl.agents.base import Agent, Phase, State, template
 from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec
 from delayrl.envs.making import make
@@ -69,6 +69,8 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
+    if not all(isinstance(phase, Phase) for phase in agent.phases()):
+        raise DelayRLError("an agent's phases() returns a tuple of Phase; of one, as (Phase(…),)")
     for phase in agent.phases():
         if low := [name for name in ("every", "updates", "batch") if getattr(phase, name) < 1]:
             raise DelayRLError(f"{' and '.join(low)} of an agent's phase are at least 1; got {phase[:3]}")

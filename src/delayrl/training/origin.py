@@ -28,7 +28,13 @@ def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], C
     Of runs that have `begun` with it, this is what they say, although it may have been trained further since, or its
     newest checkpoint may be damaged.
     """
-    config, checkpoint = run.config, run.latest()
+    try:
+        config, checkpoint = run.config, run.latest()
+    except DelayRLError as error:
+        if not begun or not all(one.exists and "from" in one.config.get("origin", {}) for one in begun):
+            raise
+        hint = f"`delayrl train {begun[0].path} --steps {begun[0].config['schedule']['steps']}`"
+        raise DelayRLError(f"{error}; the run that began with it goes on without it: {hint}") from error
     names = ("agent", "env", "delay", "seed", "configuration")
     described = {name: config[name] for name in names if name in config}
     described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}

@@ -40,9 +40,15 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     """
     runs, config = group.folders, group.setup.config
     replaced = [run for run in runs if overwrite and run.exists and run.config]
+    begun = group.further or any(run.exists and (any(run.checkpoints()) or run.read("rows")) for run in runs)
     for run, seed in zip(runs, group.seeds, strict=True):
         if run.exists and run not in replaced and not group.further:
-            _check_same(run, config | {"seed": seed})
+            try:
+                _check_same(run, config | {"seed": seed})
+            except DelayRLError:
+                if begun:
+                    raise
+                replaced.append(run)  # another call failed before it stored anything
         elif not run.exists and not run.is_free:
             raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
     checkpoints = [] if replaced else _common_checkpoints(group, note)
@@ -119,7 +125,8 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
     crashed = all(run.exists for run in runs) and max(steps) <= first  # between the seeds' first checkpoints
     if any(good) and (group.further or not crashed or len({*steps} - {0}) > 1):
         at = ", ".join(f"{run.path} at {step:,}" for run, step in zip(runs, steps, strict=True))
-        raise DelayRLError(f"the seeds stand at different steps ({at}); train these alone, or --overwrite them all")
+        alone = ", ".join(f"--seed {seed} --out {run.path}" for run, seed in zip(runs, group.seeds, strict=True))
+        raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({alone})")
     return []
 
 
@@ -127,6 +134,9 @@ def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
     """Raise DelayRLError if a folder holds a run with another configuration."""
     stored = run.config
     added_later = {**values_of(Schedule()), **OLDER, **wanted.get("unnamed", {})}
+    if "lengths" in stored.get("origin", {}) and "lengths" not in wanted.get("origin", {}):
+        line = f"{run.path} was trained further, to {stored['schedule']['steps']:,} steps"
+        raise DelayRLError(f"{line}: `delayrl train {run.path} --steps N` does so again; or give another --out")
     if stored.get("origin", {}) != wanted.get("origin", {}):
         raise DelayRLError(
             f"{run.path} holds a run that began otherwise: with other networks, or shorter; give another --out, or "

@@ -17,7 +17,6 @@ from delayrl.core.precision import setting
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import TaskLike, WrapperLike, as_task, closing
-from delayrl.errors import DelayRLError
 from delayrl.play.policy import spec_of
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
@@ -104,13 +103,7 @@ def train(
     folders = run_folders(setup.condition, numbers, out)
     source = None
     if start_from is not None:
-        try:
-            origin, source = source_of(RunFolder(path_of(start_from)), [] if overwrite else folders)
-        except DelayRLError as error:
-            if overwrite or not all(folder.exists and "from" in folder.config.get("origin", {}) for folder in folders):
-                raise
-            hint = f"`delayrl train {folders[0].path} --steps {setup.schedule.steps}`"
-            raise DelayRLError(f"{error}; the run that began with it goes on without it: {hint}") from error
+        origin, source = source_of(RunFolder(path_of(start_from)), [] if overwrite else folders)
         setup = replace(setup, origin={"from": origin})
     ways = Ways(device=device, track=track, threads=threads, slim=slim, callback=callback, progress=progress)
     train_group(setup, numbers, folders, ways, given=delay, overwrite=overwrite, source=source)

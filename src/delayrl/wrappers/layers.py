@@ -52,7 +52,10 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
     """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
     if not isinstance(observations, Box) or len(observations.shape) != 1:
         got = " ".join(str(observations).split())[:200]
-        hint = ": flatten=True (--flatten) turns a Dict or an image into one" if observations.is_np_flattenable else ""
+        flat = getattr(observations, "is_np_flattenable", False)
+        hint = (
+            ": gymnasium.wrappers.FlattenObservation, or flatten=True (--flatten) here, makes one of it" if flat else ""
+        )
         raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}{hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
         raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")

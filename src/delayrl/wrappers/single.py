@@ -113,6 +113,11 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         idle: NDArray[Any] | None = None,
         step_seconds: float | None = None,
     ) -> None:
+        if not isinstance(env, gym.Env):
+            hint = (
+                "DelayedVector takes a vector" if isinstance(env, gym.vector.VectorEnv) else "gymnasium.make makes one"
+            )
+            raise DelayRLError(f"Delayed takes an environment; got {env!r:.60}: {hint}")
         check_layers(env)
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
