@@ -23,7 +23,6 @@ import which
 matplotlib.use("Agg")
 from learning import curves as learning
 from learning import times
-from matplotlib import pyplot
 from PIL import Image
 from speed import tables as speed
 
@@ -49,57 +48,12 @@ COLOURS = {
     "any-age": "#8250df",
 }
 
-Curves = dict[str, dict[int, list[float]]]  # label -> step -> one mean return per seed
-
 
 def read(name: str) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
     """Return configurations by run, rows, and evaluations of a results file."""
     lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
     configs = {line["run"]: line["config"] for line in lines if "config" in line}
     return configs, [line for line in lines if "step" in line], [line for line in lines if "evaluation" in line]
-
-
-def curves(name: str) -> Curves:
-    """Return the mean returns of each seed's evaluations, by agent; an agent's reference has a label of its own."""
-    configs, rows, _ = read(name)
-    episodes: dict[tuple[str, int, int], list[float]] = defaultdict(list)
-    for row in rows:
-        agent = configs[row["run"]]["agent"]
-        label = agent if row["policy"] == "agent" else f"{agent} {row['policy']}"
-        episodes[label, row["step"], row["run"]].append(row["return"])
-    result: Curves = defaultdict(lambda: defaultdict(list))
-    for (label, step, _), returns in sorted(episodes.items()):
-        result[label][step].append(float(np.mean(returns)))
-    return result
-
-
-def draw(name: str, title: str, out: Path, labels: dict[str, str]) -> None:
-    """Draw return against steps: a line for the mean over seeds, a thin line for each seed."""
-    figure, axes = pyplot.subplots(figsize=(7.5, 4), layout="constrained")
-    for label, points in curves(name).items():
-        if label not in labels:
-            continue
-        steps = sorted(points)
-        seeds = np.array([points[step] for step in steps])
-        axes.plot(steps, seeds, color=COLOURS[label], alpha=0.25, linewidth=1)
-        axes.plot(steps, seeds.mean(1), color=COLOURS[label], linewidth=2.2, label=labels[label])
-    axes.set(xlabel="environment steps", ylabel="return", title=title)
-    axes.grid(alpha=0.25)
-    axes.legend(frameon=False)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    out.parent.mkdir(exist_ok=True)
-    figure.savefig(out, dpi=140)
-    pyplot.close(figure)
-
-
-def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any]]]]:
-    """Return (configuration, evaluation on unseen start states) of each run, by agent."""
-    configs, _, lines = read(name)
-    result: dict[str, list[tuple[dict[str, Any], dict[str, Any]]]] = defaultdict(list)
-    for line in lines:
-        result[line["evaluation"]["agent"]].append((configs[line["run"]], line["evaluation"]))
-    return result
 
 
 def table(name: str) -> str:
@@ -317,15 +271,6 @@ def main() -> None:
     images = root / "docs" / "img"
     last_frame(images / "episodes.gif")
     measured(images / "measure.png")
-    words = {
-        "vdpo": "VDPO, delay 5",
-        "vdpo reference": "its reference, no delay",
-        "sac-memoryless": "SAC without memory, delay 5",
-    }
-    more = {"bpql": "BPQL, delay 5"}
-    balanced = words | more | {"any-age": "any-age, delay 5"}
-    draw("pendulum", "InvertedPendulum-v5, three seeds", images / "return-against-steps.png", balanced)
-    draw("reacher", "Reacher-v5, three seeds", images / "reacher.png", words | more)
     if (HERE / "results" / "pusher-random.jsonl").exists():
         title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
         shown = {agent: COLOURS[agent] for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
