@@ -13,7 +13,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import ModuleType
@@ -146,13 +146,14 @@ def one_line(what: str) -> Iterator[None]:
         raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)}")) from error
 
 
-def contents(thing: Any) -> Any:
-    """Return what a dataclass holds, as JSON can; None if it cannot, or for anything else that is not plain."""
+def contents(thing: Any, skipped: Collection[str] = ()) -> Any:
+    """Return what a dataclass holds, but for some fields, as JSON can; None if it cannot, or if it is not plain."""
     if is_dataclass(thing) and not isinstance(thing, type):
-        inner = {f.name: contents(value) for f in fields(thing) if (value := getattr(thing, f.name)) is not None}
+        held = {field.name: getattr(thing, field.name) for field in fields(thing) if field.name not in skipped}
+        inner = {name: contents(value, skipped) for name, value in held.items() if value is not None}
         return None if None in inner.values() else {"": type(thing).__qualname__, **inner}
     if isinstance(thing, tuple | list):
-        items = [contents(value) for value in thing if value is not None]
+        items = [contents(value, skipped) for value in thing if value is not None]
         return None if None in items else items
     if isinstance(thing, Mapping):
         return contents(sorted((str(key), value) for key, value in thing.items() if value is not None))

@@ -128,6 +128,10 @@ def test_acting_never_peeks(name: str, rng: np.random.Generator) -> None:
     """A deterministic action depends on nothing but (observation, age, actions since), whatever the truth is."""
     state = random_state(TINY[name], Spec(OBS, ACT, 3))
     act = jax.jit(functools.partial(TINY[name].act, explore=False))
+    looked = [seen(3, age, rng) for age in (0, 3)]
+    assert not any(
+        same(act(state, x, jax.random.key(0)), act(state, x._replace(obs=x.obs - 1), jax.random.key(0))) for x in looked
+    )
     for age in range(4):
         what = seen(3, age, rng)
         action = act(state, what, jax.random.key(0))

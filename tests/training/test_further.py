@@ -226,9 +226,7 @@ def test_a_run_whose_source_is_gone_is_told_how_to_go_on(tmp_path: Path) -> None
     old = train(SHRINK, tmp_path / "old", steps=200)
     train(SHRINK, tmp_path / "new", steps=200, start_from=old, callback=lambda step, runs: True)
     shutil.rmtree(old.path)
-    with pytest.raises(
-        delayrl.DelayRLError, match=r"old is not .*goes on without it: `delayrl train .*new --steps 200`"
-    ):
+    with pytest.raises(delayrl.DelayRLError, match=r"old is not .*without it: `delayrl train .*new --steps 200`"):
         train(SHRINK, tmp_path / "new", steps=200, start_from=old.path)
     assert delayrl.go_on(tmp_path / "new", 200, progress=False).rows()[-1]["step"] == 200
 

@@ -139,6 +139,13 @@ def test_a_call_that_failed_is_in_nobodys_way(tmp_path: Path) -> None:
         train("random", tmp_path / "run", env=broken)
     assert train("random", tmp_path / "run", delay=1).config["delay"] == 1
     assert_refused(tmp_path, "another delay", lambda: train("random", tmp_path / "run", delay=2))
+    for name, text in (("config.json", '{"model_type": "bert"}'), ("episodes.jsonl", "{}")):
+        shutil.copytree(before.path, tmp_path / name)
+        for other in ("checkpoints", "replay"):
+            shutil.rmtree(tmp_path / name / other)
+        (tmp_path / name / "rows.jsonl").unlink()
+        (tmp_path / name / name).write_text(text)
+        assert_refused(tmp_path, "damaged|another", lambda name=name: train("random", tmp_path / name, delay=2))
 
 
 def test_a_run_is_trained_by_one_process(tmp_path: Path) -> None:

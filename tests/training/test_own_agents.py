@@ -291,7 +291,7 @@ def test_what_a_run_could_not_keep_is_refused_before_it(how: str, words: str, tm
 
 
 def test_two_agents_without_a_name_are_two_runs(tmp_path: Path) -> None:
-    """What is no option of theirs tells them apart; the run goes on with either, given by hand."""
+    """What is no option of theirs tells them apart, also where the run goes on."""
 
     @dataclass(frozen=True)
     class Local(Shrink):
@@ -301,6 +301,8 @@ def test_two_agents_without_a_name_are_two_runs(tmp_path: Path) -> None:
     assert train(Local(level=0.3), tmp_path / "run").rows() == run.rows()
     with pytest.raises(DelayRLError, match="holds a run with another agent"):
         train(Local(level=0.9), tmp_path / "run")
+    with pytest.raises(DelayRLError, match="a run goes on with its own agent"):
+        delayrl.go_on(run, 300, agent=Local(level=0.9), env=make_arm, progress=False)
     longer = delayrl.go_on(run, 300, agent=Local(level=0.3), env=make_arm, progress=False)
     assert longer.config["unnamed"] == run.config["unnamed"]
 

@@ -22,7 +22,7 @@ LONGEST, MOST_STATES = 100_000, 1000
 def whole_steps(steps: Any) -> int:
     """Check a delay. Raises DelayRLError for anything but a whole number of 0 to `LONGEST` steps."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
-        hint = f"; for a time write {steps}s" if isinstance(steps, float) else ""
+        hint = f"; for a time write {steps}s" if isinstance(steps, float) and 0 < steps < LONGEST else ""
         raise DelayRLError(f"a delay counts whole environment steps; got {steps!r}{hint}")
     if steps < 0:
         raise DelayRLError(f"a delay cannot be negative; got {steps:g}")

@@ -4,6 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +160,7 @@ def from_log(
     if unit not in reading.UNITS:
         raise DelayRLError(f"time stamps are in {', '.join(reading.UNITS)}; got {unit!r}")
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
-        if value is not None and not (isinstance(value, int | float) and np.isfinite(value) and value >= least):
+        if value is not None and not (isinstance(value, Real) and np.isfinite(value) and value >= least):
             raise DelayRLError(f"--{name} is a time in seconds; got {value}")
     table = reading.Table(path)
     exact = reading.read_stamps(table, stamp, received, episode, unit)

@@ -157,7 +157,8 @@ def resolve(
     condition = Condition(name, str(task), text, preset, protocol, dict(overrides), schedule.steps)
     made = as_trained(override(base.agent, values), schedule)
     things = {"agent": (name, base.agent), "env": (str(task), task), "delay": (str(text), parsed)}
-    unnamed = {part: contents(thing) for part, (shown, thing) in things.items() if "<" in shown}
+    known = {option.name for option in options(base.agent)}  # are told apart by their values
+    unnamed = {part: contents(thing, known) for part, (shown, thing) in things.items() if "<" in shown}
     return Setup(condition, task, made, schedule, parsed, chosen, {k: _digest(x) for k, x in unnamed.items() if x})
 
 

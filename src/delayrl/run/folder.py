@@ -33,7 +33,7 @@ FORMAT = 1
 NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
 CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
-MORE: dict[str, Any] = {"versions": dict, "later_versions": list, "configuration": str, "origin": dict}
+MORE: dict[str, Any] = {"versions": dict, "later_versions": list, "configuration": str, "origin": dict, "unnamed": dict}
 """What it may hold besides."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")

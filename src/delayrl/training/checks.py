@@ -69,7 +69,7 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     for name, count in (("replay_capacity", least * setup.entries(spec)), ("random_steps", least)):
         if getattr(schedule, name) < count:
             raise DelayRLError(f"{name} must be at least {count} here; got {getattr(schedule, name)}")
-    if not all(isinstance(phase, Phase) for phase in agent.phases()):
+    if not isinstance(agent.phases(), tuple) or not all(isinstance(phase, Phase) for phase in agent.phases()):
         raise DelayRLError("an agent's phases() returns a tuple of Phase; of one, as (Phase(…),)")
     for phase in agent.phases():
         if low := [name for name in ("every", "updates", "batch") if getattr(phase, name) < 1]:
@@ -99,8 +99,8 @@ def _check_act(agent: Agent, spec: Spec) -> None:
     for explore in (True, False):
         seen = Seen(obs, number, actions, obs if explore and agent.privileged else None)  # type: ignore[arg-type]
         action = jax.eval_shape(functools.partial(agent.act, explore=explore), state, seen, key)
-        if action.shape != (spec.action_size,):
-            raise DelayRLError(f"an agent's act returns an action of shape {(spec.action_size,)}; got {action.shape}")
+        if (got := getattr(action, "shape", type(action).__name__)) != (spec.action_size,):
+            raise DelayRLError(f"an agent's act returns an action of shape {(spec.action_size,)}; got {got}")
 
 
 def _checked_state(agent: Agent, spec: Spec) -> State:

@@ -94,7 +94,11 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
     origin = dict(config.get("origin", {}))
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]
-    setup = replace(setup, origin=origin, unnamed=config.get("unnamed", {}))
+    known = config.get("unnamed", {})
+    for part in ("agent", "env"):
+        if part in known and setup.unnamed.get(part, known[part]) != known[part]:
+            raise DelayRLError(f"a run goes on with its own {part}; that which is given holds something else")
+    setup = replace(setup, origin=origin, unnamed=known)
     names = {"agent": config["agent"], "env": config["env"]}  # its rows name what it began with
     return replace(setup, condition=replace(setup.condition, **names, overrides=overrides_of(setup.config)))
 

@@ -31,10 +31,13 @@ def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], C
     try:
         config, checkpoint = run.config, run.latest()
     except DelayRLError as error:
-        if not begun or not all(one.exists and "from" in one.config.get("origin", {}) for one in begun):
+        if not begun or not all(
+            one.exists and "from" in one.config.get("origin", {}) and any(one.checkpoints()) for one in begun
+        ):
             raise
-        hint = f"`delayrl train {begun[0].path} --steps {begun[0].config['schedule']['steps']}`"
-        raise DelayRLError(f"{error}; the run that began with it goes on without it: {hint}") from error
+        where = begun[0].path if len(begun) == 1 else begun[0].path.parent
+        hint = f"`delayrl train {where} --steps {begun[0].config['schedule']['steps']}`"
+        raise DelayRLError(f"{error}; what has begun in {where} goes on without it: {hint}") from error
     names = ("agent", "env", "delay", "seed", "configuration")
     described = {name: config[name] for name in names if name in config}
     described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}

@@ -40,13 +40,13 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     """
     runs, config = group.folders, group.setup.config
     replaced = [run for run in runs if overwrite and run.exists and run.config]
-    begun = group.further or any(run.exists and (any(run.checkpoints()) or run.read("rows")) for run in runs)
+    bare = not group.further and all(_is_bare(run) for run in runs if run.exists)
     for run, seed in zip(runs, group.seeds, strict=True):
-        if run.exists and run not in replaced and not group.further:
+        if run.exists and run.config and run not in replaced and not group.further:
             try:
                 _check_same(run, config | {"seed": seed})
             except DelayRLError:
-                if begun:
+                if not bare:
                     raise
                 replaced.append(run)  # another call failed before it stored anything
         elif not run.exists and not run.is_free:
@@ -125,9 +125,17 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
     crashed = all(run.exists for run in runs) and max(steps) <= first  # between the seeds' first checkpoints
     if any(good) and (group.further or not crashed or len({*steps} - {0}) > 1):
         at = ", ".join(f"{run.path} at {step:,}" for run, step in zip(runs, steps, strict=True))
-        alone = ", ".join(f"--seed {seed} --out {run.path}" for run, seed in zip(runs, group.seeds, strict=True))
-        raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({alone})")
+        steps_wanted = group.setup.schedule.steps
+        further = [f"delayrl train {run.path} --steps {steps_wanted}" for run in runs]
+        new = [f"--seed {seed} --out {run.path}" for run, seed in zip(runs, group.seeds, strict=True)]
+        hint = ", ".join(further if group.further else new)
+        raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({hint})")
     return []
+
+
+def _is_bare(run: RunFolder) -> bool:
+    """Return whether a folder holds a configuration and nothing else that anyone could miss."""
+    return all(file.name == "config.json" for file in run.path.rglob("*") if not file.is_dir())
 
 
 def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
