@@ -26,9 +26,9 @@ def run(given: argparse.Namespace) -> None:
 
     stored = {"env": given.env, "env_kwargs": dict(given.env_kwargs), "agent": given.agent}
     shown = (given.delay, given.seed, given.camera, given.compare, given.seconds)
-    for folder in filter(None, (given.run, given.compare)):
-        say_unfinished(folder)
     moments = watch(given.run, given.out, *shown, **stored)
     several = "" if given.seconds is None else "episode {0.episode}, "
     results = (several.format(moment) + f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
     print(f"{given.out}: {'; beside it '.join(results)}")
+    for folder in filter(None, (given.run, given.compare)):
+        say_unfinished(folder)

@@ -87,8 +87,13 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
     check_limit(env, str(setup.task))
+    return template(agent, spec)
+
+
+def check_agent(agent: Agent, spec: Spec) -> None:
+    """Raise DelayRLError if a run could not store, restore or log what the agent's functions return. Traces them."""
     _check_act(agent, spec)
-    return _checked_state(agent, spec)
+    _check_updates(agent, spec)
 
 
 def _check_act(agent: Agent, spec: Spec) -> None:
@@ -103,10 +108,9 @@ def _check_act(agent: Agent, spec: Spec) -> None:
             raise DelayRLError(f"an agent's act returns an action of shape {(spec.action_size,)}; got {got}")
 
 
-def _checked_state(agent: Agent, spec: Spec) -> State:
-    """Return the shapes and types of the agent's state. Raises DelayRLError if a run could not store or restore it."""
-    state = template(agent, spec)
-    leaves = named_leaves(state)
+def _check_updates(agent: Agent, spec: Spec) -> None:
+    """Raise DelayRLError unless updates keep the form of the agent's state, and log single numbers."""
+    leaves = named_leaves(template(agent, spec))
     for name, leaf in leaves.items():
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             raise DelayRLError(f"the agent's state holds a random key, {name}: store jax.random.key_data of it")
@@ -126,7 +130,6 @@ def _checked_state(agent: Agent, spec: Spec) -> State:
             if name in METRICS or shape != ():
                 why = "which every run has" if name in METRICS else f"of shape {shape}"
                 raise DelayRLError(f"metrics of an agent are single numbers with names of their own; got {name}, {why}")
-    return state
 
 
 def check_repeats(setup: Setup) -> None:

@@ -25,7 +25,7 @@ from delayrl.run.condition import Setup, resolve
 from delayrl.run.folder import RunFolder, RunLike, hold, path_of
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers, on_device
-from delayrl.training.checks import check_fit, check_memory, check_repeats, check_ways
+from delayrl.training.checks import check_agent, check_fit, check_memory, check_repeats, check_ways
 from delayrl.training.learner import compiled
 from delayrl.training.loop import run
 from delayrl.training.machine import shared
@@ -129,6 +129,7 @@ def train_group(
         envs = [held.enter_context(closing(env)) for env in made]
         spec = spec_of(envs[0])
         shapes = check_fit(setup, envs[0])  # before anything is stored
+        check_agent(setup.agent, spec)
         check_memory(setup, spec, len(numbers), ways.device)
         keep_compiled()
         if ways.device != "gpu":
