@@ -12,11 +12,13 @@ from scipy import stats
 from conftest import record
 from delayrl.agents.base import reference_of
 from delayrl.agents.dcac import DCAC, Roll, values
+from delayrl.agents.registry import AGENTS
 from delayrl.core import networks
 from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
+from delayrl.training.checks import check_agent
 
 AGENT = DCAC(hidden=(16, 16), batch_size=16)
 DELAY = 4
@@ -312,3 +314,8 @@ def test_a_stretch_counts_what_arrived_in_it(delay: str) -> None:
         assert float(rolls.reward[i, :count].sum()) == earned[last] - earned[first]
         checked += count > 1
     assert checked > 50
+
+
+def test_the_preset_matched_is_traced_as_a_run_begins() -> None:
+    """With the checks of types and shapes, which are the tests' own; its temperature is learned."""
+    check_agent(AGENTS["dcac"].presets["matched"].agent, Spec(10, 2, 3))
