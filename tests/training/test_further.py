@@ -349,39 +349,19 @@ def began(old: Agent, new: Agent) -> tuple[Arrays, Arrays, str]:
     return stored, flatten_tree(jax.tree.map(lambda x: x[0], begun)), notes[0]
 
 
+BOTH = "delayed.actor, delayed.critic, delayed.target, reference.critic, reference.target"
+REFERENCE = "reference.actor, reference.critic, reference.target, reference.log_temperature"
+WHOLE = "actor, critic, target, log_temperature; new: no network"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "taken", "pairs"),
     [
-        (
-            "bpql",
-            "lifting",
-            "delayed.actor, delayed.critic, delayed.target, reference.critic, reference.target",
-            {"delayed.actor": "actor", "reference.critic": "critic"},
-        ),
-        (
-            "lifting",
-            "vdpo",
-            "reference.actor, reference.critic, reference.target, reference.log_temperature",
-            {"reference.actor": "reference.actor", "reference.critic": "reference.critic"},
-        ),
-        (
-            "lifting",
-            "bpql",
-            "actor, critic, target, log_temperature; new: no network",
-            {"actor": "delayed.actor", "critic": "delayed.critic"},
-        ),
-        (
-            "lifting",
-            "sac",
-            "actor, critic, target, log_temperature; new: no network",
-            {"actor": "reference.actor", "critic": "reference.critic"},
-        ),
-        (
-            "sac",
-            "vdpo",
-            "reference.actor, reference.critic, reference.target, reference.log_temperature",
-            {"reference.actor": "actor", "reference.target": "target"},
-        ),
+        ("bpql", "lifting", BOTH, {"delayed.actor": "actor", "reference.critic": "critic"}),
+        ("lifting", "vdpo", REFERENCE, {name: name for name in ("reference.actor", "reference.critic")}),
+        ("lifting", "bpql", WHOLE, {name: f"delayed.{name}" for name in ("actor", "critic")}),
+        ("lifting", "sac", WHOLE, {name: f"reference.{name}" for name in ("actor", "critic")}),
+        ("sac", "vdpo", REFERENCE, {f"reference.{name}": name for name in ("actor", "target")}),
         ("vdpo", "bpql", "critic, target, log_temperature; new: actor", {"critic": "reference.critic"}),
     ],
 )

@@ -14,7 +14,7 @@ from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
 from delayrl.measure.log import Estimated, from_log, plot
 from delayrl.measure.probing import Counts, Probed, probe
-from delayrl.measure.reading import SLOW, UNITS
+from delayrl.measure.reading import UNITS, in_doubt
 
 COLUMNS = ("time", "commands", "observations", "episode", "stamp", "received")
 
@@ -64,8 +64,8 @@ def run(given: argparse.Namespace) -> None:
             result.save(given.save)
         if given.plot:
             plot(result, given.plot)
-        sure = given.unit is not None or result.row <= SLOW
-        print(json.dumps(result.json()) if given.json else _show_log(result, given.save, sure))
+        doubtful = in_doubt(result.row, given.unit)
+        print(json.dumps(result.json()) if given.json else _show_log(result, given.save, doubtful))
         return
     _refuse(given, ("period", *COLUMNS, "unit", "warm_up", "plot", "save"), "a log", "an environment")
     if isinstance(given.longest, float):
@@ -121,10 +121,10 @@ def _counts(title: str, counts: Counts | None) -> list[str]:
     return [head] + [f"{'':<18}   {steps:>3}  {count / total:6.1%}" for steps, count in counts.items()]
 
 
-def _show_log(e: Estimated, saved: Path | None, sure: bool) -> str:
+def _show_log(e: Estimated, saved: Path | None, doubtful: bool) -> str:
     lines = [f"{e.path}: {e.rows:,} rows, one each {_ms(e.row)}, without the first {e.warm_up:.3g} s", ""]
     lines += _show_stamps(e) if e.method == "stamps" else _show_correlation(e)
-    if not sure:
+    if doubtful:
         lines += ["", "which delay to train with depends on the unit of the time stamps: give --unit"]
     elif e.in_step == e.train_with:
         lines += ["", f"train with: --delay {e.train_with}"]

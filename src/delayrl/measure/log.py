@@ -170,7 +170,7 @@ def from_log(
         log, row = reading.resample(reading.read_signals(table, time, commands, observations, episode, unit))
         warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
         estimated = _correlated(path, log, row, period or row, longest, warm, seed)
-    if estimated.row > reading.SLOW and given is None:
+    if reading.in_doubt(estimated.row, given):
         line = f"the rows of {path} lie {estimated.row:.3g} s apart: if its time stamps are not in seconds, say so"
         warnings.warn(f"{line} (--unit {reading.likely_unit(estimated.row)})", DelayWarning, stacklevel=2)
     return estimated

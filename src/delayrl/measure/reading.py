@@ -87,6 +87,11 @@ def read_stamps(
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit], table.recordings(episode)
 
 
+def in_doubt(row: float, unit: str | None) -> bool:
+    """Return whether rows lie so many seconds apart that their unit is doubtful, and nobody gave one."""
+    return unit is None and row > SLOW
+
+
 def likely_unit(row: float) -> str:
     """Return the unit that time stamps may have where rows seem to lie so many seconds apart."""
     return next((name for name in ("ms", "us") if row * UNITS[name] <= SLOW), "ns")

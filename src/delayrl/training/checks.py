@@ -90,17 +90,20 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     return template(agent, spec)
 
 
-def check_agent(agent: Agent, spec: Spec) -> None:
-    """Raise DelayRLError if a run could not store, restore or log what the agent's functions return. Traces them."""
-    _check_act(agent, spec)
-    _check_updates(agent, spec)
+def check_agent(agent: Agent, spec: Spec, state: State) -> None:
+    """Raise DelayRLError if a run could not store, restore or log what the agent's functions return. Traces them.
+
+    `state` is the agent's `template`.
+    """
+    _check_act(agent, spec, state)
+    _check_updates(agent, spec, state)
 
 
-def _check_act(agent: Agent, spec: Spec) -> None:
+def _check_act(agent: Agent, spec: Spec, state: State) -> None:
     """Raise DelayRLError unless the agent's action has the task's size, in training and in evaluation."""
     shape, number = jax.ShapeDtypeStruct, jax.ShapeDtypeStruct((), jnp.int32)
     obs, actions = shape((spec.obs_size,), jnp.float32), shape((spec.delay, spec.action_size), jnp.float32)
-    state, key = template(agent, spec), jax.eval_shape(lambda: jax.random.key(0))
+    key = jax.eval_shape(lambda: jax.random.key(0))
     for explore in (True, False):
         seen = Seen(obs, number, actions, obs if explore and agent.privileged else None)  # type: ignore[arg-type]
         action = jax.eval_shape(functools.partial(agent.act, explore=explore), state, seen, key)
@@ -108,9 +111,9 @@ def _check_act(agent: Agent, spec: Spec) -> None:
             raise DelayRLError(f"an agent's act returns an action of shape {(spec.action_size,)}; got {got}")
 
 
-def _check_updates(agent: Agent, spec: Spec) -> None:
+def _check_updates(agent: Agent, spec: Spec, state: State) -> None:
     """Raise DelayRLError unless updates keep the form of the agent's state, and log single numbers."""
-    leaves = named_leaves(template(agent, spec))
+    leaves = named_leaves(state)
     for name, leaf in leaves.items():
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             raise DelayRLError(f"the agent's state holds a random key, {name}: store jax.random.key_data of it")

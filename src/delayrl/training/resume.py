@@ -40,13 +40,12 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     """
     runs, config = group.folders, group.setup.config
     replaced = [run for run in runs if overwrite and run.exists and run.config]
-    bare = not group.further and all(_is_bare(run) for run in runs if run.exists)
     for run, seed in zip(runs, group.seeds, strict=True):
         if run.exists and run.config and run not in replaced and not group.further:
             try:
                 _check_same(run, config | {"seed": seed})
             except DelayRLError:
-                if not bare:
+                if not all(_is_bare(other) for other in runs if other.exists):
                     raise
                 replaced.append(run)  # another call failed before it stored anything
         elif not run.exists and not run.is_free:
@@ -125,11 +124,10 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
     crashed = all(run.exists for run in runs) and max(steps) <= first  # between the seeds' first checkpoints
     if any(good) and (group.further or not crashed or len({*steps} - {0}) > 1):
         at = ", ".join(f"{run.path} at {step:,}" for run, step in zip(runs, steps, strict=True))
-        steps_wanted = group.setup.schedule.steps
-        further = [f"delayrl train {run.path} --steps {steps_wanted}" for run in runs]
-        new = [f"--seed {seed} --out {run.path}" for run, seed in zip(runs, group.seeds, strict=True)]
-        hint = ", ".join(further if group.further else new)
-        raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({hint})")
+        words = "delayrl train {} --steps {}" if group.further else "--out {} --seed {}"
+        numbers = [group.setup.schedule.steps] * len(runs) if group.further else group.seeds
+        alone = ", ".join(words.format(run.path, number) for run, number in zip(runs, numbers, strict=True))
+        raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({alone})")
     return []
 
 

@@ -129,7 +129,7 @@ def train_group(
         envs = [held.enter_context(closing(env)) for env in made]
         spec = spec_of(envs[0])
         shapes = check_fit(setup, envs[0])  # before anything is stored
-        check_agent(setup.agent, spec)
+        check_agent(setup.agent, spec, shapes)
         check_memory(setup, spec, len(numbers), ways.device)
         keep_compiled()
         if ways.device != "gpu":
