@@ -300,7 +300,8 @@ def machine(rows: list[Row]) -> str:
     peers = ", ".join(sorted({f"{n} {v}" for packages in used for n, v in packages.items() if n in PEERS}))
     dates = sorted({row["date"] for row in rows})
     return (
-        f"{words('cores')} x86 cores ({words('device')}), shared with other work. Python {words('python')}, jax {words('jax')}, "
+        f"{words('cores')} x86 cores ({words('device')}), shared with other work. "
+        f"Python {words('python')}, jax {words('jax')}, "
         f"MuJoCo {words('mujoco')}, Gymnasium {words('gymnasium')}{peers and f'; peers: {peers}'}. "
         f"Commit {commits(rows)}; {' to '.join(sorted({dates[0], dates[-1]}))}. "
         "Rows: `benchmarks/results/speed.jsonl`."

@@ -20,14 +20,13 @@ class RunPolicy:
         import delayrl
         from delayrl import Run
         from delayrl.envs.making import make
-        from delayrl.play.policy import trained_delay
         from delayrl.wrappers.layers import seconds_of
 
         self._policy = delayrl.load(path)
         spec = self._policy.spec
         self.obs_size, self.action_size, self.max_age = spec.obs_size, spec.action_size, spec.delay
         self.low, self.high = self._policy.low, self._policy.high
-        self.min_age = self._policy.min_age(trained_delay(path))
+        self.min_age = self._policy.min_age
         env = make(Run(path).config["env"])
         self.dt = seconds_of(env)
         env.close()

@@ -5,10 +5,10 @@ run. JAX is imported only when training or a policy is asked for: `delayrl.wrapp
 Importing delayrl registers its tasks: `gymnasium.make("delayrl/Ant-v4")`.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from delayrl.envs.registration import watch_gymnasium
+from delayrl.errors import import_later
 
 if TYPE_CHECKING:
     from delayrl.agents.registry import AGENTS as AGENTS
@@ -68,11 +68,4 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        try:
-            return getattr(import_module(f"delayrl.{_HOME[name]}"), name)
-        except ModuleNotFoundError as error:
-            from delayrl.errors import needs_extra
-
-            raise (needs_extra(error) or error) from error
-    raise AttributeError(f"module 'delayrl' has no attribute {name!r}")
+    return import_later(__name__, _HOME, name)

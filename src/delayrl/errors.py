@@ -1,8 +1,11 @@
 """The exceptions that people see, as a single line."""
 
+import contextlib
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from importlib import import_module
+from typing import Any
 
 
 class DelayRLError(Exception):
@@ -31,6 +34,16 @@ def needs_extra(error: BaseException) -> DelayRLError | None:
     names = [one.name or "" for one in both if isinstance(one, ModuleNotFoundError)]
     module = "".join(names[:1]).partition(".")[0]
     return DelayRLError(f"this needs {module}: pip install 'delayrl[train]'") if module in TRAIN else None
+
+
+def import_later(package: str, homes: Mapping[str, str], name: str) -> Any:
+    """Return a name of a package from the module that has it, for `__getattr__`: `homes` says which."""
+    if name not in homes:
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    try:
+        return getattr(import_module(f"{package}.{homes[name]}"), name)
+    except ModuleNotFoundError as error:
+        raise (needs_extra(error) or error) from error
 
 
 ELSEWHERE = {
@@ -65,11 +78,22 @@ def near_names(name: str, known: Iterable[str]) -> list[str]:
 
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type where the message is empty."""
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return "".join(filter(str.isprintable, lines[0]))
 
 
 def described(error: BaseException) -> str:
     """Return the type of an error and the first line of its message, if it has one."""
     name, line = type(error).__name__, first_line(error)
     return name if line == name else f"{name}: {line}"
+
+
+@contextlib.contextmanager
+def one_line(what: str) -> Iterator[None]:
+    """Raise whatever code of the user raises as a DelayRLError: `what`, and the error's own type and message."""
+    try:
+        yield
+    except DelayRLError:
+        raise
+    except (Exception, SystemExit) as error:  # a script without a guard may end the process when it is imported
+        raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)}")) from error

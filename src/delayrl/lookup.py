@@ -4,7 +4,6 @@ A name is `module:object`, or that of an entry point: an installed package decla
 `delayrl.agents`, to stand for a `module:object` of its own.
 """
 
-import contextlib
 import difflib
 import functools
 import importlib
@@ -19,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from delayrl.errors import DelayRLError, described, needs_extra
+from delayrl.errors import DelayRLError, described, one_line
 
 
 def find_object(name: str) -> Any:
@@ -133,17 +132,6 @@ def parse_arguments(text: str) -> tuple[dict[str, Any], str]:
     if inside.strip() or not bracket:
         raise ValueError("no closing bracket")
     return kwargs, rest.strip()
-
-
-@contextlib.contextmanager
-def one_line(what: str) -> Iterator[None]:
-    """Raise whatever code of the user raises as a DelayRLError: `what`, and the error's own type and message."""
-    try:
-        yield
-    except DelayRLError:
-        raise
-    except (Exception, SystemExit) as error:  # a script without a guard may end the process when it is imported
-        raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)}")) from error
 
 
 def contents(thing: Any, skipped: Collection[str] = ()) -> Any:

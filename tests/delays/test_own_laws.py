@@ -65,22 +65,18 @@ def test_an_own_law_is_played_as_ours() -> None:
     assert_alike(delayrl.make("Pendulum-v1", observed), delayrl.make("Pendulum-v1", 3))
 
 
-def test_an_own_law_may_have_all_that_ours_have() -> None:
-    """What an episode draws of it is checked and named all the same."""
-    law = PerEpisode(Shifted())
-    assert str(law) == "episode:<Shifted:1>"
+def test_what_an_episode_draws_of_an_own_law_is_checked() -> None:
+    law = PerEpisode(Wrong())
+    assert str(law) == "episode:<Wrong:1>"
     with pytest.raises(DelayRLError, match="drew 9 steps, and its maximum is 1"):
         law.draw(0, np.random.default_rng(0))
 
 
-class Shifted:
+class Wrong:
     maximum = 1
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         return 9, 0
-
-    def shifted(self, steps: int) -> "Shifted":
-        return self
 
 
 def assert_alike(one: Any, other: Any) -> None:

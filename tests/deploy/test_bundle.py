@@ -102,7 +102,7 @@ def test_an_extra_that_is_not_installed(module: str, error: type, monkeypatch: p
     def lacks(name: str) -> None:
         raise ModuleNotFoundError(name=module)
 
-    monkeypatch.setattr(deploy, "import_module", lacks)
+    monkeypatch.setattr("delayrl.errors.import_module", lacks)
     with pytest.raises(error, match="train" if error is DelayRLError else None):
         deploy.export_run  # noqa: B018
 

@@ -333,11 +333,12 @@ def log(path: Path, u: np.ndarray, y: np.ndarray, time: np.ndarray | None = None
         (["q1_cmd", "q2_c"], ["q1", "q2_v"], (["q1_cmd", "q2_cmd"], ["q1", "q2_velocity"])),
         (["q2_cmd"], ["q2"], (["q2_cmd"], ["q2_velocity"])),
         (["q1_c"], ["q1"], (["q1_cmd", "q1_cmd_seen"], ["q1"])),
+        ("q1_c", "q1", (["q1_cmd", "q1_cmd_seen"], ["q1"])),
         (None, ["q1"], (["action", "action_raw"], ["q1"])),
     ],
 )
 def test_whole_names_come_before_prefixes(
-    commands: list | None, observations: list, wanted: tuple, tmp_path: Path
+    commands: list | str | None, observations: list | str, wanted: tuple, tmp_path: Path
 ) -> None:
     """A word that is the name of a column means this column alone, and no prefix takes it from there."""
     names = ["time", "q1", "q1_cmd", "q1_cmd_seen", "q2_cmd", "q2_velocity", "action", "action_raw"]

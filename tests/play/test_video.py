@@ -299,7 +299,7 @@ def test_a_renderer_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
         raise RuntimeError("no pictures\ntoday")
 
     monkeypatch.setattr(video, "render", fail)
-    with pytest.raises(DelayRLError, match=r"^delayrl/Walk-v0 cannot be rendered here: no pictures$"):
+    with pytest.raises(DelayRLError, match=r"^delayrl/Walk-v0 cannot be rendered here: RuntimeError: no pictures$"):
         next(_episode(make("delayrl/Walk-v0", 3), STILL, 5, None, 4, 1))
 
 

@@ -149,6 +149,17 @@ def test_evaluate_takes_a_run_its_folder_or_a_policy(vdpo: Run) -> None:
         delayrl.evaluate(policy, env="Reacher-v5", agent="vdpo")
 
 
+def test_a_policy_knows_its_delay(tmp_path: Path) -> None:
+    """Without one given, it is evaluated under that of its training, and it warns of ages that it never learned."""
+    run = train("random", tmp_path / "run", delay="uniform:1:3", steps=100, random_steps=100)
+    policy = delayrl.load(run)
+    result = delayrl.evaluate(policy, episodes=2, env=run.config["env"])
+    assert result["delay"] == "uniform:1:3"
+    assert result["returns"] == delayrl.evaluate(run, episodes=2)["returns"]
+    with pytest.warns(delayrl.DelayWarning, match="learned no age below 1 steps, and delay 0 shows younger ones"):
+        delayrl.evaluate(policy, episodes=1, env=run.config["env"], delay=0)
+
+
 def test_runs_on_the_command_line(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["runs", str(vdpo.path.parent)])
     head, row = capsys.readouterr().out.splitlines()

@@ -202,11 +202,8 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
             if getattr(entries[key], "ndim", None) != 2:
                 got = f"the shape {entries[key].shape[1:]}" if hasattr(entries[key], "shape") else "several parts"
                 raise DelayRLError(f"observations must be flat vectors; {key or 'the task'} has {got}")
-        laws = zip(*(jax.tree.leaves(tree, is_leaf=_is_none) for tree in (self._axes, self.delay)), strict=True)
+        trees = self._axes, self.delay
+        laws = zip(*(jax.tree.leaves(tree, is_leaf=lambda x: x is None) for tree in trees), strict=True)
         for axis, array in laws:
             if axis == 0 and len(array) != count:
                 raise DelayRLError(f"the delay has laws for {len(array)} environments; there are {count}")
-
-
-def _is_none(leaf: Any) -> bool:
-    return leaf is None

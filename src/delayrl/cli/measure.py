@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
@@ -54,7 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Measure the delay and print it."""
     path = Path(given.target)
-    if path.is_file() or path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
+    if os.path.isfile(path) or path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
         _refuse(given, ("episodes", "env_kwargs", "wrappers", "flatten"), "an environment", "a log")
         if isinstance(given.longest, int):
             raise DelayRLError(f"--longest is a time such as 200ms in a log; got {given.longest}")

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 from delayrl.delays import laws
 from delayrl.delays.episodes import OURS, PerEpisode, Sum
 from delayrl.delays.laws import Constant, DelayLaw
-from delayrl.delays.own import OwnLaw, is_law, own_law
+from delayrl.delays.own import own_law
 from delayrl.errors import DelayRLError
 
 Rule = Literal["newest", "fifo", "raw", "wait"]
@@ -32,7 +32,7 @@ class Channel:
         if isinstance(self.law, str):
             raise DelayRLError(f"a channel takes a law, not text: write as_delay({self.law!r})")
         if not isinstance(self.law, OURS):
-            object.__setattr__(self, "law", own_law(self.law) if is_law(self.law) else Constant(self.law))  # type: ignore[arg-type]
+            object.__setattr__(self, "law", own_law(self.law) if hasattr(self.law, "draw") else Constant(self.law))  # type: ignore[arg-type]
         if self.rule not in get_args(Rule):
             raise DelayRLError(f"an arrival rule is one of {', '.join(get_args(Rule))}; got {self.rule!r}")
 
@@ -114,10 +114,7 @@ class Delay:
         Raises:
             DelayRLError: the actions have a delay that is random within an episode.
         """
-        lag = self.action.law
-        if isinstance(lag, PerEpisode) and not self.action.constant:
-            return Delay(self._later_by_episode(lag))
-        if not self.action.constant:
+        if not self.action.steady:
             raise DelayRLError(
                 f"training takes actions with a constant delay, at least within an episode; got {self.action}. "
                 f"Hold early ones back until {self.action.maximum} steps have passed "
@@ -125,13 +122,10 @@ class Delay:
             )
         if not self.action.maximum:
             return Delay(self.observation)
-        return Delay(replace(self.observation, law=self.observation.law.shifted(self.action.maximum)))
-
-    def _later_by_episode(self, lag: PerEpisode) -> Channel:
-        """Return the channel of the observations, later by the delay of each episode."""
-        if self.observation.constant:
-            return Channel(lag.shifted(self.observation.maximum))
-        return replace(self.observation, law=Sum(self.observation.law, lag))
+        if self.observation.constant and self.action.constant:
+            return Delay(Channel(Constant(self.maximum)))
+        law, lag = (Constant(side.maximum) if side.constant else side.law for side in (self.observation, self.action))
+        return Delay(Channel(Sum(law, lag), "newest" if self.observation.constant else self.observation.rule))
 
     def acted(self) -> "Delay":
         """Remove the delay of the rewards, as evaluation and deployment do."""
@@ -168,10 +162,8 @@ def _shortest(law: DelayLaw) -> int:
         case PerEpisode():
             return _shortest(law.law)
         case Sum():
-            return _shortest(law.law) + _shortest(law.episode)
-        case OwnLaw():
-            return law.later  # its own shortest is unknown
-    return 0
+            return _shortest(law.law) + _shortest(law.lag)
+    return 0  # of a user's law it is unknown
 
 
 def short_label(text: int | str) -> int | str:

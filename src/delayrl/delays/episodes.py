@@ -1,8 +1,7 @@
 """Delays that differ between episodes: drawn once in each, or left open by a sensor that runs on its own clock."""
 
 import math
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,37 +35,29 @@ class PerEpisode:
         travel = state - 1 if state else self.law.draw(0, random)[0]
         return travel, travel + 1
 
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, law=self.law.shifted(steps))
-
     def __str__(self) -> str:
         return f"episode:{str(self.law).removeprefix('uniform:')}"
 
 
 @dataclass(frozen=True)
 class Sum:
-    """Add the delay of an episode to that of each message. `Delay.observed` makes it; it has no text of its own."""
+    """Add a delay that an episode keeps to that of each message. `Delay.observed` makes it; it has no text."""
 
     law: DelayLaw
-    episode: PerEpisode
+    lag: DelayLaw  # a constant one, or one of an episode
 
     @property
     def maximum(self) -> int:
         """The longest delay of any message."""
-        return self.law.maximum + self.episode.maximum
+        return self.law.maximum + self.lag.maximum
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw both; the state holds those of both laws."""
-        states = self.episode.maximum + 2  # 0 before the first message, then 1 plus a delay
-        state, of_episode = divmod(state, states)
-        lag, of_episode = self.episode.draw(of_episode, random)
+        states = self.lag.maximum + 2  # 0 before the first message, then 1 plus a delay
+        state, of_lag = divmod(state, states)
+        lag, of_lag = self.lag.draw(of_lag, random)
         travel, state = self.law.draw(state, random)
-        return travel + lag, state * states + of_episode
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, law=self.law.shifted(steps))
+        return travel + lag, state * states + of_lag
 
 
 OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, PerEpisode, Sum, OwnLaw)

@@ -7,9 +7,9 @@ and sets it to 0 at the start of an episode. `str` of a law is a text that `as_d
 import itertools
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -50,9 +50,6 @@ class DelayLaw(Protocol):
             The travel time in steps, and the state for the next message.
         """
 
-    def shifted(self, steps: int) -> "DelayLaw":
-        """Return the law whose travel times are longer by `steps`."""
-
 
 @dataclass(frozen=True)
 class Constant:
@@ -71,10 +68,6 @@ class Constant:
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Return `steps`."""
         return self.steps, state
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law with a delay that is longer by `steps`."""
-        return replace(self, steps=self.steps + steps)
 
     def __str__(self) -> str:
         return str(self.steps)
@@ -107,10 +100,6 @@ class Choice:
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw one of the delays; the state stays 0."""
         return self.steps[bisect_right(self._cumulative, random.random())], state
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, steps=tuple(s + steps for s in self.steps), name="")
 
     @cached_property
     def _cumulative(self) -> list[float]:
@@ -155,10 +144,6 @@ class Markov:
         chain_state = bisect_right(self._cumulative[state], random.random())
         return self.steps[chain_state], chain_state + 1
 
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, steps=tuple(s + steps for s in self.steps), name="")
-
     @cached_property
     def stationary(self) -> tuple[float, ...]:
         """The long-run share of messages in each state. A chain that falls apart has several; this is one of them."""
@@ -198,10 +183,6 @@ class Recorded:
         """Return the next recorded delay; the state is 1 plus its index."""
         index = state % len(self.steps) if state else int(random.integers(len(self.steps)))
         return self.steps[index], index + 1
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law whose delays are longer by `steps`."""
-        return replace(self, steps=tuple(s + steps for s in self.steps))
 
     def __str__(self) -> str:
         return f"recorded:{','.join(map(str, self.steps))},"

@@ -1,24 +1,23 @@
 """Laws of users: classes of their own, named `module:Class(argument=value)` or by an entry point.
 
-A law of one's own is a frozen dataclass with `maximum` and `draw`. `OwnLaw` makes a `DelayLaw` of it: it checks each
-travel time, adds what a delay of the actions adds, and writes the text that a run keeps.
+A law of one's own is a frozen dataclass with `maximum` and `draw`. `OwnLaw` checks its travel times and writes the text
+that a run keeps.
 """
 
 import re
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 
-from delayrl.delays.laws import whole_steps
-from delayrl.errors import DelayRLError
+from delayrl.delays.laws import DelayLaw, whole_steps
+from delayrl.errors import DelayRLError, one_line
 from delayrl.lookup import (
     entry_points,
     find_object,
     is_unsafe,
     name_of_object,
-    one_line,
     parse_arguments,
     public_name,
     with_arguments,
@@ -26,17 +25,6 @@ from delayrl.lookup import (
 
 GROUP = "delayrl.delays"
 PAGE = "docs/delays.md shows one"
-
-
-class UserLaw(Protocol):
-    """What a law of one's own must have: see `delayrl.delays.DelayLaw`."""
-
-    @property
-    def maximum(self) -> int:
-        """The longest delay."""
-
-    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
-        """Draw the travel time of the next message, and the state for the one after it."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +35,11 @@ class OwnLaw:
         law: draws; None where a run has no name for it.
         text: names it: `module:Class(argument=value)`, or `<Class:maximum>` if it cannot be imported.
         maximum: the longest delay.
-        later: steps that are added to each travel time.
     """
 
-    law: UserLaw | None
+    law: DelayLaw | None
     text: str
     maximum: int
-    later: int = 0
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw from the user's law. Raises DelayRLError for a travel time that is not in 0..maximum, or no law."""
@@ -65,23 +51,12 @@ class OwnLaw:
         except (TypeError, ValueError) as error:
             line = f"{self.text} drew {drawn!r:.80}, not a travel time and the next state: {PAGE}"
             raise DelayRLError(line) from error
-        travel = whole_steps(travel) + self.later
-        if travel > self.maximum:
-            longest = self.maximum - self.later
-            raise DelayRLError(f"{self.text} drew {travel - self.later} steps, and its maximum is {longest}")
-        return travel, state
-
-    def shifted(self, steps: int) -> Self:
-        """Return the law with travel times that are longer by `steps`. Its text does not say so."""
-        return replace(self, maximum=self.maximum + steps, later=self.later + steps)
+        if whole_steps(travel) > self.maximum:
+            raise DelayRLError(f"{self.text} drew {travel} steps, and its maximum is {self.maximum}")
+        return int(travel), state
 
     def __str__(self) -> str:
         return self.text
-
-
-def is_law(thing: Any) -> bool:
-    """Return whether something, an instance or a class, is meant to be a law of a user."""
-    return hasattr(thing, "draw")
 
 
 def own_law(law: Any) -> OwnLaw:
@@ -123,7 +98,7 @@ def find_law(text: str, stored: Path | None = None) -> OwnLaw | None:
         line = f"{stored} came with a law of delays that could run any code, {source}"
         raise DelayRLError(f"{line}: if you mean it, move its module out of that folder")
     kind = find_object(source)
-    if not (isinstance(kind, type) and is_dataclass(kind) and is_law(kind)):
+    if not (isinstance(kind, type) and is_dataclass(kind) and hasattr(kind, "draw")):
         raise DelayRLError(f"{source} is no law of delays, because it is no dataclass with draw: {PAGE}")
     return own_law(_made(source, kind, text))
 

@@ -10,6 +10,8 @@ import numpy as np
 from delayrl.delays.laws import Recorded, whole_steps
 from delayrl.errors import DelayRLError, first_line
 
+NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
+
 
 def recorded(path: str | Path, step_seconds: float | None = None, unit: str = "") -> Recorded:
     """Read measured delays from a file.
@@ -105,5 +107,4 @@ def rounded_up(steps: float) -> int:
 
 def is_number(text: str) -> bool:
     """Tell whether a text is a number, nan or infinity. Callers refuse the last two with messages of their own."""
-    number = r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
-    return bool(re.fullmatch(number, text.strip(), re.IGNORECASE))
+    return bool(re.fullmatch(rf"{NUMBER}|[+-]?(nan|inf|infinity)", text.strip(), re.IGNORECASE))

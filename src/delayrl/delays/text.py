@@ -30,13 +30,13 @@ from delayrl.delays import laws
 from delayrl.delays.channels import CHANNELS, PRESETS, Channel, Delay, Rule
 from delayrl.delays.episodes import PerEpisode, unsynchronised
 from delayrl.delays.laws import Constant, DelayLaw, whole_steps
-from delayrl.delays.own import UserLaw, find_law
-from delayrl.delays.recordings import in_steps, is_number, recorded, rounded_up
+from delayrl.delays.own import find_law
+from delayrl.delays.recordings import NUMBER, in_steps, recorded, rounded_up
 from delayrl.errors import DelayRLError
 
 StepSeconds = float | Callable[[], float | None] | None
 """The length of an environment step, or a function that returns it; None if it is unknown."""
-DelayLike = float | str | DelayLaw | UserLaw | Channel | Delay
+DelayLike = float | str | DelayLaw | Channel | Delay
 """Steps, a text, a law (yours too) or a channel of the observations, or a delay."""
 FORMS = (
     "a delay is 5, 80ms, uniform:1:5, choice:1=0.1,5=0.9, poisson:MEAN:MAX, gamma:MEAN:DEVIATION:MAX, "
@@ -200,7 +200,7 @@ class DelayParser:
 
     def _split(self, word: str) -> tuple[float, str]:
         """Split a word into its number and its unit."""
-        match = re.fullmatch(r"([+-]?[\d.]+(?:e[+-]?\d+)?)(s|ms)?", word.strip())
-        if not match or not is_number(match[1]):
+        match = re.fullmatch(rf"({NUMBER})\s*(s|ms)?", word.strip())
+        if not match:
             raise DelayRLError(f"{word!r} in the delay {self._text!r} is not a number ({FORMS})")
         return float(match[1]), match[2] or ""

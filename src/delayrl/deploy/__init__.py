@@ -4,7 +4,6 @@ Importing this package does not import JAX; only `export_run` and the backend `j
 safetensors, `Controller` NumPy alone.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from delayrl.deploy.runtime.controller import Controller as Controller
@@ -12,7 +11,7 @@ from delayrl.deploy.runtime.controller import ControlPolicy as ControlPolicy
 from delayrl.deploy.runtime.controller import OverrunError as OverrunError
 from delayrl.deploy.runtime.episode import ClockError as ClockError
 from delayrl.deploy.runtime.telemetry import Statistics as Statistics
-from delayrl.errors import needs_extra
+from delayrl.errors import import_later
 
 if TYPE_CHECKING:
     from delayrl.deploy.adapter import AdaptedPolicy as AdaptedPolicy
@@ -30,9 +29,4 @@ LATER = {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"} | 
 
 
 def __getattr__(name: str) -> Any:
-    if module := LATER.get(name):
-        try:
-            return getattr(import_module(f"delayrl.deploy.{module}"), name)
-        except ModuleNotFoundError as error:
-            raise (needs_extra(error) or error) from error
-    raise AttributeError(f"module 'delayrl.deploy' has no attribute {name!r}")
+    return import_later(__name__, LATER, name)

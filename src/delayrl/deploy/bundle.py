@@ -11,7 +11,7 @@ from delayrl.deploy.backends.network import Act, Network
 from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import WEIGHTS, check_files, read_files
 from delayrl.deploy.runtime.episode import LONGEST_STEP, SHORTEST_STEP
-from delayrl.errors import DelayRLError, needs_extra
+from delayrl.errors import DelayRLError, one_line
 
 BACKENDS = ("numpy", "onnx", "jax")
 
@@ -104,10 +104,8 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
     metadata, files = read_files(path, (WEIGHTS,))
     network, arrays = check_files(path, metadata, files)
     if backend == "jax":
-        try:
+        with one_line("the backend jax cannot be imported"):
             from delayrl.deploy.backends.jax_policy import jax_policy as policy
-        except ModuleNotFoundError as error:
-            raise (needs_extra(error) or error) from error
     elif backend == "onnx":
         from delayrl.deploy.backends.onnx_policy import onnx_policy as policy
     else:

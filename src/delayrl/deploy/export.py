@@ -98,7 +98,7 @@ def describe(run: RunFolder, config: dict[str, Any], step: int, policy: Policy, 
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {
         **{name: config.get(name) for name in copied},
-        "ages": [policy.min_age(env.delay), policy.spec.delay],
+        "ages": [policy.min_age, policy.spec.delay],
         "action_delay": env.delay.action.maximum,
         "dt": seconds,
         "observation": space_json(env.observation_space),

@@ -2,13 +2,12 @@
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from delayrl.deploy.files import DOCUMENT, GRAPH, LIMITS, WEIGHTS, check_files, check_target, read_files, write_files
-from delayrl.errors import DelayRLError, first_line
+from delayrl.errors import DelayRLError, one_line
 
 CARD = "README.md"
 
@@ -27,7 +26,7 @@ def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
     metadata, files = read_files(bundle, (WEIGHTS, GRAPH))
     check_files(bundle, metadata, files)
     hub, api = _hub()
-    with _one_line(f"cannot push to {repo}"):
+    with one_line(f"cannot push to {repo}"):
         url = api.create_repo(repo, private=private, exist_ok=True)
         content = {CARD: card(metadata, repo).encode(), **files}
         operations: list[Any] = [hub.CommitOperationAdd(name, data) for name, data in content.items()]
@@ -53,7 +52,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
     _, api = _hub()
     names = [DOCUMENT, WEIGHTS, GRAPH]
     with tempfile.TemporaryDirectory(prefix="delayrl-pull-") as folder:
-        with _one_line(f"cannot pull from {repo}"):
+        with one_line(f"cannot pull from {repo}"):
             revision = api.repo_info(repo, revision=revision).sha  # what is checked is what is downloaded
             paths = api.get_paths_info(repo, names, revision=revision)
             sizes = {path.path: getattr(path, "size", None) for path in paths}
@@ -61,7 +60,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
             size = sizes[name]
             if not isinstance(size, int) or size > LIMITS[name]:
                 raise DelayRLError(f"{name} in {repo} is not a file, or is larger than {LIMITS[name]:,} bytes")
-            with _one_line(f"cannot pull {name} from {repo}"):
+            with one_line(f"cannot pull {name} from {repo}"):
                 api.hf_hub_download(repo, name, revision=revision, local_dir=folder)
         if DOCUMENT not in sizes:
             raise DelayRLError(f"{repo} holds no policy bundle: it has no {DOCUMENT}")
@@ -112,11 +111,3 @@ def _hub() -> tuple[Any, Any]:
     except ImportError as error:
         raise DelayRLError("the hub needs the package huggingface_hub: pip install 'delayrl[hub]'") from error
     return huggingface_hub, huggingface_hub.HfApi()
-
-
-@contextmanager
-def _one_line(what: str) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:  # the client passes on the exceptions of its own libraries
-        raise DelayRLError(f"{what}: {''.join(filter(str.isprintable, first_line(error)))[:200]}") from error

@@ -1,5 +1,6 @@
 """Tasks with a delay."""
 
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
@@ -18,9 +19,6 @@ from delayrl.wrappers.layers import check_limit as check_limit
 from delayrl.wrappers.layers import name_of as name_of
 from delayrl.wrappers.layers import seconds_of as seconds_of
 from delayrl.wrappers.transit import Fill
-
-OPTIONS = ("env_kwargs", "wrappers", "flatten", "normalise", "rescale", "history", "fill", "step_seconds")
-"""Of `make` itself. All others are keyword arguments of what makes the environment."""
 
 
 def make(
@@ -79,7 +77,7 @@ def _made(task: Task, options: dict[str, Any]) -> Any:
     try:
         return task.make(**options)
     except DelayRLError as error:
-        near = [ours for name in options for ours in near_names(name, OPTIONS)]
+        near = [ours for name in options for ours in near_names(name, inspect.signature(make).parameters)]
         if near and isinstance(error.__cause__, TypeError):
             raise DelayRLError(f"{error}; did you mean {', '.join(near)}?") from error.__cause__
         raise

@@ -27,8 +27,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation
 
 from delayrl.envs.lookup import find_id, find_maker, find_stored, refuse_instance, with_version
-from delayrl.errors import DelayRLError
-from delayrl.lookup import name_of_object, one_line, parse_arguments, with_arguments
+from delayrl.errors import DelayRLError, one_line
+from delayrl.lookup import name_of_object, parse_arguments, with_arguments
 
 Env = gym.Env[Any, Any]
 FLATTEN = "flatten"

@@ -23,7 +23,7 @@ from gymnasium.spaces import Box
 
 from delayrl.envs.making import name_of
 from delayrl.envs.task import TaskLike, as_task, closing
-from delayrl.errors import DelayRLError, described
+from delayrl.errors import DelayRLError, one_line
 from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push
 
 Counts = dict[int, int]  # {steps of delay: how often}
@@ -85,13 +85,9 @@ def probe(
     """
     if episodes < 1 or longest < 1:
         raise DelayRLError(f"episodes and longest count from 1; got {episodes} and {longest}")
-    with nullcontext(env) if isinstance(env, gym.Env) else closing(as_task(env).make()) as task:
-        try:
-            return _probe(task, episodes, seed, longest, wrap)
-        except DelayRLError:
-            raise
-        except Exception as error:  # an environment may raise anything
-            raise DelayRLError(f"{task} failed while it was played: {described(error)}") from error
+    made = nullcontext(env) if isinstance(env, gym.Env) else closing(as_task(env).make())
+    with made as task, one_line(f"{task} failed while it was played"):
+        return _probe(task, episodes, seed, longest, wrap)
 
 
 def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Iterable[int]], Iterable[int]]) -> Probed:

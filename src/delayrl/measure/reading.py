@@ -46,6 +46,7 @@ def read_signals(
     CSV files need a header, and separate columns with commas, semicolons or tabs.
     """
     stamps = table.find(time, ("time", "timestamp", "t"), "time stamps", "--time", needed=True)
+    commands, observations = ([one] if isinstance(one, str) else one for one in (commands, observations))
     groups = {}
     others = [name for name in table.names if name != stamps]
     words = {word.lower() for word in (*(commands or ()), *(observations or ()))}
@@ -132,7 +133,8 @@ class Table:
         self.path = path
         if not path.is_file():
             raise DelayRLError(f"{path}: no such file")
-        head = path.read_bytes()[:4]
+        with path.open("rb") as file:
+            head = file.read(4)
         if not head:
             raise DelayRLError(f"{path} is empty")
         self._columns: dict[str, Any] = _parquet(path) if head == b"PAR1" else _csv(path)
@@ -172,6 +174,10 @@ class Table:
         try:
             values = np.array(cells, float)
         except (TypeError, ValueError):
+            sizes = [np.size(cell) for cell in cells]
+            if row := next((i for i, size in enumerate(sizes) if size != sizes[0]), 0):
+                counts = f"{sizes[row]} numbers, and that before {sizes[row - 1]}"
+                raise DelayRLError(f"{self.path}, row {row + 1}: column {name} has {counts}; drop such rows") from None
             row = next((i for i, cell in enumerate(cells) if not _number(cell)), 0)
             shown = "an empty cell" if cells[row] in ("", None) else f"{cells[row]!r}, which is not a number"
             where = f"{self.path}, row {row + 1}"

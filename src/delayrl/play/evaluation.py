@@ -21,7 +21,7 @@ from delayrl.envs.making import check_limit, delay_of, make, name_of
 from delayrl.envs.task import Task, TaskLike, as_task, closing
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
-from delayrl.play.policy import Policy, load, spec_of, task_of, trained_delay
+from delayrl.play.policy import Policy, load, spec_of, task_of
 from delayrl.run.agents import AgentLike
 from delayrl.run.folder import RunFolder, RunLike, path_of
 from delayrl.run.rows import deviation
@@ -193,20 +193,18 @@ def evaluate(
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
-    usual: DelayLike
-    learned = 0
     if isinstance(run, Policy):
         if env is None:
             raise DelayRLError("a policy does not say what its task is: give env, or a run")
         if agent is not None:
             raise DelayRLError("a policy is of its own agent: leave agent out, or give a run")
-        task, policy, name, usual = as_task(env, env_kwargs), run, type(run.agent).__name__, run.spec.delay
+        task, policy, name = as_task(env, env_kwargs), run, type(run.agent).__name__
     else:
         config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)
-        policy, name, usual = load(run, task, agent=agent), config["agent"], trained_delay(run)
-        learned = policy.min_age(usual)
-    if delay is not None and (played := delay_of(task, delay)).minimum < learned:
-        line = f"{name} learned no age below {learned} steps, and delay {played.label()} shows younger ones"
+        policy, name = load(run, task, agent=agent), config["agent"]
+    usual: DelayLike = policy.spec.delay if policy.trained is None else policy.trained
+    if delay is not None and (played := delay_of(task, delay)).minimum < policy.min_age:
+        line = f"{name} learned no age below {policy.min_age} steps, and delay {played.label()} shows younger ones"
         warnings.warn(f"{line}; a Controller holds these back", DelayWarning, stacklevel=2)
     return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
 
@@ -226,9 +224,8 @@ def sweep(
     """
     name, task = RunFolder(path_of(run)).config["agent"], task_of(run, env, env_kwargs)
     policy = load(run, task, agent=agent)
-    shortest = policy.min_age(trained_delay(run))
     for delay in range(policy.spec.delay + 1):
-        yield _play(policy, name, task, delay, episodes, seed) | {"learned": delay >= shortest}
+        yield _play(policy, name, task, delay, episodes, seed) | {"learned": delay >= policy.min_age}
 
 
 def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:

@@ -31,6 +31,7 @@ class Policy:
         spec: sizes of the task, and the longest age it was trained for.
         low, high: the range of its actions, [A], in single precision, rounded inwards.
         step: how many environment steps it has learned from; None if unknown.
+        trained: the delay that it was trained under; None if unknown.
     """
 
     def __init__(
@@ -40,12 +41,12 @@ class Policy:
         spec: Spec,
         low: NDArray[Any],
         high: NDArray[Any],
-        seed: int = 0,
         step: int | None = None,
+        trained: Delay | None = None,
     ) -> None:
-        self.agent, self.state, self.spec, self.step = agent, state, spec, step
+        self.agent, self.state, self.spec, self.step, self.trained = agent, state, spec, step, trained
         self.low, self.high = inner_range(low, high)
-        self._key = jax.random.key(seed)
+        self._key = jax.random.key(0)
 
         def decide(state: State, seen: Seen, key: Key) -> Action:
             with jax.default_matmul_precision("float32"):  # as in evaluation: a GPU's own is coarser
@@ -53,9 +54,10 @@ class Policy:
 
         self._act = jax.jit(decide)
 
-    def min_age(self, trained: Delay) -> int:
-        """Return the shortest age that it learned under this delay, after the start of an episode, in steps."""
-        return 0 if getattr(self.agent, "every_age", False) else trained.minimum
+    @property
+    def min_age(self) -> int:
+        """The shortest age that it learned, after the start of an episode, in steps; 0 if unknown."""
+        return 0 if self.trained is None or getattr(self.agent, "every_age", False) else self.trained.minimum
 
     def act(self, obs: NDArray[Any], info: dict[str, Any]) -> NDArray[np.float32]:
         """Return the action, in the task's own units: the policy's mode, but a draw of agents whose evaluation samples.
@@ -134,7 +136,8 @@ def restored(
     agent = agent_of(config, run.path, given)
     if given is None:
         warn_of_other_code(config, run.path, agent)
-    with closing(make(task, stored_delay(config["delay"], run.path))) as env:
+    trained = stored_delay(config["delay"], run.path)
+    with closing(make(task, trained)) as env:
         spec, actions = spec_of(env), env.action_space
     try:
         state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)
@@ -143,7 +146,7 @@ def restored(
         if not instead:
             raise
         raise DelayRLError(f"the run does not fit the {' and the '.join(instead)} given: {error}") from error
-    return Policy(agent, state, spec, actions.low, actions.high, step=checkpoint.step)
+    return Policy(agent, state, spec, actions.low, actions.high, checkpoint.step, trained)
 
 
 def spec_of(env: Any) -> Spec:

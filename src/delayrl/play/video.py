@@ -18,7 +18,7 @@ from tqdm import tqdm
 from delayrl.delays import Delay, DelayLike
 from delayrl.envs.making import check_limit, make, name_of
 from delayrl.envs.task import Task, TaskLike
-from delayrl.errors import DelayRLError, first_line
+from delayrl.errors import DelayRLError, one_line
 from delayrl.play import stepping
 from delayrl.play.evaluation import HELD_OUT, check_fits, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
@@ -151,14 +151,10 @@ def _rendering(task: Task, delay: Delay) -> Any:
 
 
 def _picture(env: Any) -> Picture:
-    try:
+    mujoco = hasattr(env.unwrapped, "mujoco_renderer")
+    hint = " (Linux without a screen needs EGL, package libegl1)" if mujoco else ""
+    with one_line(f"{name_of(env)} cannot be rendered here{hint}"):
         return render(env)
-    except DelayRLError:
-        raise
-    except Exception as error:  # a renderer may raise anything
-        mujoco = hasattr(env.unwrapped, "mujoco_renderer")
-        hint = "; Linux without a screen needs EGL (package libegl1)" if mujoco else ""
-        raise DelayRLError(f"{name_of(env)} cannot be rendered here: {first_line(error)}{hint}") from error
 
 
 def _together(episodes: Sequence[Iterator[Moment]]) -> Iterator[list[Moment]]:

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import AGENTS, Registration, registered
-from delayrl.errors import DelayRLError, DelayWarning
-from delayrl.lookup import entry_points, find_object, is_unsafe, name_of_object, one_line, public_name
+from delayrl.errors import DelayRLError, DelayWarning, one_line
+from delayrl.lookup import entry_points, find_object, is_unsafe, name_of_object, public_name
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.folder import versions_in
 
