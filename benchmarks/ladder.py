@@ -98,7 +98,7 @@ def rows_of(files: list[Path], tables: list[Collected]) -> str:
 
 
 def trained_with(file: Path) -> list[dict[str, Any]]:
-    """Return the versions, commits and hardware of a table's cells that have ended; `read_table` has those of all."""
+    """Return the versions, commits and hardware of a table's cells that have ended."""
     query = "SELECT versions FROM runs JOIN cells ON cells.id = runs.cell WHERE state = 'done' ORDER BY cells.number"
     with contextlib.closing(sqlite3.connect(file)) as table:
         return [used for (text,) in table.execute(query) for used in json.loads(text)]

@@ -14,6 +14,7 @@ from speed.works import OWN, SIZES
 
 from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
+from delayrl.run.folder import versions_in
 
 RESULTS = Path(__file__).parent.parent / "results"
 Row = dict[str, Any]
@@ -169,7 +170,7 @@ def trial(grid: str, option: str, default: int, before: str = "", *, timed: bool
     """Return a Markdown table of what VDPO learns with values of an option: the cells of a grid that have ended."""
     if not (table := RESULTS / f"{grid}.sqlite").exists():
         return ""
-    rows, standing, used, _ = read_table(table)
+    rows, standing, configs, _ = read_table(table)
     ended = [(cell, progress) for cell, progress in standing if progress.state == "done"]
     if not ended:
         return ""
@@ -184,7 +185,7 @@ def trial(grid: str, option: str, default: int, before: str = "", *, timed: bool
         cells = [f"{condition.env}, Δ = {condition.delay}", str(condition.overrides.get(option, default))]
         cells += [f"{np.mean(list(means.values())):.1f}", f"{np.mean(last):.1f}", " · ".join(f"{x:.1f}" for x in last)]
         body.append(cells + [f"{speed * len(cell.seeds):.0f}" if speed else ""] * timed)
-    commit = commits([{"versions": versions} for versions in used])
+    commit = commits([{"versions": used} for config in configs for used in versions_in(config)])
     about = f"VDPO, preset `{condition.preset}`, {len(cell.seeds)} seeds in lockstep. Commit {commit}."
     about = f"{about} Rows: `benchmarks/results/{table.name}`."
     results = markdown_table((titles + "|seed-steps/s" * timed).split("|"), body)

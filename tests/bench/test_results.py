@@ -14,7 +14,7 @@ from support import tiny
 import delayrl
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid
-from delayrl.bench.results import cells_done, collect, read_table, rows_of, versions_of
+from delayrl.bench.results import cells_done, collect, configs_of, read_table, rows_of
 from delayrl.bench.status import progress, standing
 from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
@@ -65,11 +65,12 @@ def test_round_trip(finished, tmp_path: Path) -> None:
     assert len(expected) == 2 * 2 * 2
     assert expected[0] | {"cell": grid.cells[0].id} == expected[0]
     assert collect(grid, runs, tmp_path / "mixed.sqlite") == len(expected)
-    rows, cells, used, configs = read_table(tmp_path / "mixed.sqlite")
+    rows, cells, configs, description = read_table(tmp_path / "mixed.sqlite")
     assert rows == expected
     assert cells == standing(grid.cells, runs)
-    assert used == versions_of(grid.cells, runs)
-    assert used[0]["cores"]
+    assert configs == configs_of(grid.cells, runs)
+    assert configs[0]["versions"]["cores"]
+    assert description == grid.description
     assert [config["seed"] for config in configs] == [0, 1]
     assert {row["configuration"] for row in rows} == {config["configuration"] for config in configs}
     assert configs[0]["cost"] == {"parameters": 0, "gradient_steps": {}, "batches": [], "flops": 0.0}
@@ -257,7 +258,7 @@ def test_cells_of_other_tables(finished, tmp_path: Path) -> None:
     assert collect(ours, tmp_path / "gone", tmp_path / "ours.sqlite", [tmp_path / "theirs.sqlite"]) == 8
     one, other = (read_table(tmp_path / f"{name}.sqlite") for name in ("ours", "theirs"))
     assert one.standing == other.standing[::-1]
-    assert (one.rows, one.versions, one.configs) == (other.rows, other.versions, other.configs)
+    assert (one.rows, one.configs) == (other.rows, other.configs)
     (tmp_path / "theirs.sqlite").unlink()
     before = (tmp_path / "ours.sqlite").read_bytes()
     collect(ours, tmp_path / "gone", tmp_path / "ours.sqlite")

@@ -46,7 +46,7 @@ def collected(*cells: tuple[Standing, Any]) -> Collected:
         for step, returns in evaluations.items()
         for value in returns
     ]
-    return Collected(rows, [made for made, _ in cells], [], [])
+    return Collected(rows, [made for made, _ in cells], [], "")
 
 
 def test_the_table_has_each_policy_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

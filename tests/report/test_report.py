@@ -1,5 +1,6 @@
 """The files of a report, its command, and what it refuses."""
 
+import json
 import re
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from delayrl.report.__main__ import main
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
 from delayrl.report.summary import summarise
+from delayrl.run.rows import CONDITION
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
@@ -96,3 +98,13 @@ def test_command_of_a_bad_file(
     said = capsys.readouterr().err
     assert said.count("\n") == 1, said
     assert "bad.jsonl, line 1" in said
+
+
+def test_a_line_that_a_crash_cut_is_left_out(tmp_path: Path) -> None:
+    """The last one, if it has no end; as run folders are read."""
+    whole = json.dumps({name: "x" for name in CONDITION} | {"step": 1})
+    (tmp_path / "rows.jsonl").write_text(f'{whole}\n{{"agent": "sac", "st')
+    assert [row["step"] for row in read_rows([tmp_path / "rows.jsonl"])] == [1]
+    (tmp_path / "rows.jsonl").write_text(f'{whole}\n{{"agent": "sac", "st\n')
+    with pytest.raises(DelayRLError, match="line 2: this is no row"):
+        list(read_rows([tmp_path / "rows.jsonl"]))

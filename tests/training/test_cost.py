@@ -102,6 +102,23 @@ def test_branches_are_known_where_the_count_decides() -> None:
     assert sum(p.flops for p in products) == pytest.approx(once * (inner + 2 * (~taken).mean() + 0.5))
 
 
+def test_booleans_and_fractions_of_the_count() -> None:
+    """They may decide too: booleans that are added, quotients, and what is rounded to an integer or taken for truth."""
+    x = jnp.ones((2, 3))
+
+    def program(count: jax.Array) -> jax.Array:
+        even, third = ((count % n == 0).astype(jnp.int32) for n in (2, 3))
+        gates = (even + third == 2, even - third < 0, count / 10 < 0.5, (count / 10).astype(jnp.int32) == 1)
+        gates += ((even - third).astype(bool), (count - 20) // 7 == -2)
+        return sum(jax.lax.cond(gate, lambda: (x @ x.T).sum(), lambda: 0.0) for gate in gates)
+
+    counts = np.arange(24)
+    products, _ = follow(jax.make_jaxpr(program)(jnp.int32(0)).jaxpr, [counts])
+    even, third = counts % 2 == 0, counts % 3 == 0
+    gates = (even & third, third & ~even, counts < 5, counts // 10 == 1, even != third, (counts - 20) // 7 == -2)
+    assert [p.flops for p in products] == [pytest.approx(24 * gate.mean()) for gate in gates]
+
+
 def test_a_loop_of_unknown_length_has_unknown_flops() -> None:
     x = jnp.ones((3, 3))
     loop = lambda y: jax.lax.while_loop(lambda y: y.sum() < 9, lambda y: y @ x, y)  # noqa: E731

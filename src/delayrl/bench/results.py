@@ -156,13 +156,6 @@ def cells_done(file: Path) -> int:
         return int(table.execute("SELECT COUNT(*) FROM cells WHERE state = 'done'").fetchone()[0])
 
 
-def description_of(file: Path) -> str:
-    """Return the description of a table's grid, which stands below the heading of its report."""
-    with _open(file) as table:
-        found = table.execute("SELECT value FROM meta WHERE key = 'description'").fetchone()
-        return str(found[0]) if found else ""
-
-
 def _insert_cell(table: sqlite3.Connection, cell: Cell, number: int, p: Progress) -> None:
     values = (cell.id, number, _json(cell.json), p.state, p.step, p.speed)
     table.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?)", values)
@@ -213,23 +206,14 @@ class Collected(NamedTuple):
 
     rows: list[Row]  # as `rows_of` yields them
     standing: list[tuple[Cell, Progress]]  # its cells, and how far each was
-    versions: list[dict[str, Any]]  # libraries, commits and hardware that the cells were trained with
     configs: list[dict[str, Any]]  # the configuration of each run
-
-
-def versions_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
-    """Return the versions, commits and hardware that cells were trained with, without duplicates."""
-    return _distinct([used for config in configs_of(cells, runs) for used in versions_in(config)])
+    description: str  # of the grid
 
 
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the configurations of the runs that have begun."""
     paths = [path for cell in cells for path in folders.seed_paths(runs / cell.folder, cell.seeds)]
     return [RunFolder(path).config for path in paths if (path / "config.json").exists()]
-
-
-def _distinct(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [value for i, value in enumerate(values) if value not in values[:i]]
 
 
 def read_table(file: Path) -> Collected:
@@ -253,11 +237,14 @@ def _read(table: sqlite3.Connection, id: str | None = None) -> Collected:
         shared[run] | dict(zip(EPISODE, values, strict=True)) | _loaded(more or "{}", dict)
         for run, more, *values in table.execute(query, given)
     ]
-    versions = [dict(used) for *_, text in runs for used in _loaded(text, list)]
-    configs = [_loaded(text, dict) for *_, text, _ in runs]
-    for config in configs:
-        check_more(config, "a configuration")
-    return Collected(rows, cells, _distinct(versions), configs)
+    configs = []
+    for *_, text, used in runs:
+        first, *later = _loaded(used, list) or [{}]
+        made = {"versions": first, "later_versions": later} if later else {"versions": first}
+        configs.append(_loaded(text, dict) | made)
+        check_more(configs[-1], "a configuration")
+    description = table.execute("SELECT value FROM meta WHERE key = 'description'").fetchone() or [""]
+    return Collected(rows, cells, configs, str(description[0]))
 
 
 def _loaded(text: str, kind: type) -> Any:

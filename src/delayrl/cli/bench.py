@@ -115,20 +115,18 @@ def _collect(grid: Grid, given: argparse.Namespace) -> None:
 
 def _report(grid: Grid | None, given: argparse.Namespace) -> None:
     """Report a grid, or the table in the file that was named instead of one."""
-    from delayrl.bench.results import configs_of, description_of, read_table, rows_of, versions_of
+    from delayrl.bench.results import configs_of, read_table, rows_of
     from delayrl.report.report import report
 
     rows: Any
     if grid is None:
         folder, name = Path(given.grid).parent, Path(given.grid).stem
-        rows, cells, versions, configs = read_table(Path(given.grid))
-        description = description_of(Path(given.grid))
+        rows, cells, configs, description = read_table(Path(given.grid))
     else:
         folder, name, description = given.runs, grid.name, grid.description
         cells = standing(grid.cells, given.runs)
-        rows, versions = rows_of(grid.cells, given.runs), versions_of(grid.cells, given.runs)
-        configs = configs_of(grid.cells, given.runs)
-    page = report(rows, cells, given.out or folder / f"{name}-report", name, versions, configs, description)
+        rows, configs = rows_of(grid.cells, given.runs), configs_of(grid.cells, given.runs)
+    page = report(rows, cells, given.out or folder / f"{name}-report", name, configs, description)
     done = sum(progress.state == "done" for _, progress in cells)
     print(f"{name}: {done} of {len(cells)} cells are done\nopen {page}; the same as Markdown is beside it")
 

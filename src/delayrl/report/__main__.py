@@ -8,7 +8,6 @@ from delayrl.errors import DelayRLError
 from delayrl.report.configurations import read_configs
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
-from delayrl.run.folder import versions_in
 
 
 def main() -> None:
@@ -19,9 +18,7 @@ def main() -> None:
     parser.add_argument("--title", default="delayrl", help="title of the report (default: delayrl)")
     given = parser.parse_args()
     try:
-        configs = list(read_configs(given.rows))
-        versions = [used for config in configs if isinstance(config, dict) for used in versions_in(config)]
-        print(report(read_rows(given.rows), [], given.out, given.title, versions, configs))
+        print(report(read_rows(given.rows), [], given.out, given.title, read_configs(given.rows)))
     except DelayRLError as error:
         print(f"delayrl: {error}", file=sys.stderr)
         sys.exit(2)

@@ -56,7 +56,7 @@ def make_comparisons(results: Iterable[Result]) -> list[Comparison]:
             if isinstance(result.place.delay, int):
                 ended[result.place.setting, None].append(result)
     comparisons = []
-    for setting, delay in sorted(ended, key=lambda key: (key[0], key[1] is None, delay_order(key[1] or 0))):
+    for setting, delay in sorted(ended, key=lambda key: (key[0], delay_order(key[1]))):
         at: dict[str, dict[object, Result]] = defaultdict(dict)
         for result in ended[setting, delay]:
             at[result.place.label][result.place.env, result.place.delay, result.condition.steps] = result

@@ -1,10 +1,8 @@
 """The report as Markdown with pictures. Text from rows and grids is data, and escaped."""
 
 import html
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 from delayrl.report import wording
 from delayrl.report.comparisons import Comparison
@@ -17,13 +15,7 @@ Pictures = Mapping[tuple[Setting, str], list[str]]
 GREY = '<span style="color:#888">{}</span>'
 
 
-def markdown(
-    summary: Summary,
-    title: str,
-    pictures: Pictures,
-    versions: Sequence[Mapping[str, Any]] = (),
-    description: str = "",
-) -> str:
+def markdown(summary: Summary, title: str, pictures: Pictures, description: str = "") -> str:
     """Write the report; pictures by setting and kind, as `figures.draw` returns them."""
     legend = "† acts on the true state while it trains. ± is the standard deviation over seeds."
     parts = [
@@ -31,7 +23,7 @@ def markdown(
         _escape(description),
         f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip(),
     ]
-    parts += [_escape(line) for line in (*wording.remarks(summary), *wording.made_with(versions))]
+    parts += [_escape(line) for line in (*wording.remarks(summary), *wording.made_with(summary.versions))]
     for setting in summary.settings:
         results = [r for r in summary.results.values() if r.place.setting == setting]
         protocol, preset = _escape(setting.protocol), _escape(setting.preset)
@@ -94,9 +86,9 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
             if a is None:
                 line.append("")
                 continue
-            interval = "" if math.isnan(a.low) else f"<br>{a.low:.2f} to {a.high:.2f}"
+            interval = wording.interval((a.low, a.high), wording.normalised)
             counts = GREY.format(f"{wording.tasks(a.tasks, delay)}, {wording.count(a.runs, 'run')}")
-            line.append(f"**{a.iqm:.2f}**{interval}<br>{counts}")
+            line.append("<br>".join(filter(None, (f"**{a.iqm:.2f}**", interval, counts))))
         body.append(line)
     return markdown_table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
 
@@ -141,7 +133,8 @@ def _results(summary: Summary, results: Iterable[Result]) -> str:
         normalised, area = (wording.spread(*mean_std(x), wording.normalised) for x in (r.final, r.area))
         seeds, state = f"{r.runs}/{r.seeds}", r.unfinished or r.progress.state
         final = "<br>".join(filter(None, (normalised, wording.interval(r.final_interval, wording.normalised))))
-        reached = "<br>".join(filter(None, (wording.reached(r), wording.interval(r.steps_interval, wording.steps))))
+        first = "×" if r.missed else wording.steps(r.steps_to_threshold)
+        reached = "<br>".join(filter(None, (first, wording.interval(r.steps_interval, wording.steps))))
         body.append((*names, raw, final, area, reached, seeds, f"{r.condition.steps:,}", wording.hours(r.hours), state))
     heads = (
         "Task",

@@ -10,7 +10,6 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -24,21 +23,19 @@ from delayrl.report.tables import Table
 Names = dict[str, list[Any]]  # the data holds indices into these lists
 
 
-def page(summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = (), description: str = "") -> str:
+def page(summary: Summary, title: str, description: str = "") -> str:
     """Write the page: the template with title and data, and a policy that allows its own script alone."""
     template = resources.files("delayrl.report").joinpath("report.html").read_text("utf-8")
     script = template.split("<script>")[1].split("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    data = json.dumps(payload(summary, title, versions, description), separators=(",", ":"), allow_nan=False)
+    data = json.dumps(payload(summary, title, description), separators=(",", ":"), allow_nan=False)
     for sign in "<>&\u2028\u2029":  # none of them can end the data's element, or begin another
         data = data.replace(sign, f"\\u{ord(sign):04x}")
     values = {"title": html.escape(title), "digest": digest, "data": data}
     return re.sub(r"\{\{(title|digest|data)\}\}", lambda match: values[match[1]], template)
 
 
-def payload(
-    summary: Summary, title: str, versions: Sequence[Mapping[str, Any]] = (), description: str = ""
-) -> dict[str, Any]:
+def payload(summary: Summary, title: str, description: str = "") -> dict[str, Any]:
     """Return what the page draws: plain lists, numbers and texts."""
     results = list(summary.results.values())
     anchored: dict[tuple[Setting, str, int], Result] = {}
@@ -55,7 +52,7 @@ def payload(
         "state": wording.states(summary),
         "counts": Counter(r.progress.state for r in results),
         "remarks": [*filter(None, [description]), *wording.remarks(summary)],
-        "notes": wording.made_with(versions),
+        "notes": wording.made_with(summary.versions),
         "paper": wording.paper(summary).replace("`", ""),
         "settings": [s._asdict() | {"seeds": seeds[s]} for s in settings],
         "tasks": tasks,

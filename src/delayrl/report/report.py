@@ -1,6 +1,6 @@
 """A report: tables, figures and one page, computed from rows and written to a folder."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ def report(
     standing: Standing,
     out: Path,
     title: str = "delayrl",
-    versions: Sequence[Mapping[str, Any]] = (),
     configs: Iterable[Mapping[str, Any]] = (),
     description: str = "",
 ) -> Path:
@@ -28,7 +27,6 @@ def report(
         standing: as for `summarise`; may be empty.
         out: the folder.
         title: the heading.
-        versions: libraries, commit and hardware that made the rows, as in a run's configuration.
         configs: as for `summarise`; may be empty.
         description: what stands below the heading, such as that of a grid.
 
@@ -40,9 +38,9 @@ def report(
         raise DelayRLError("there is nothing to report: no cells and no rows")
     try:
         pictures = figures.draw(summary, out / "img")
-        text = markdown(summary, title, pictures, versions, description)
+        text = markdown(summary, title, pictures, description)
         (out / "report.md").write_text(text, encoding="utf-8", errors="replace")
-        text = page(summary, title, versions, description)
+        text = page(summary, title, description)
         (out / "report.html").write_text(text, encoding="utf-8", errors="replace")
     except OSError as error:
         raise DelayRLError(f"the report cannot be written to {out}: {error.strerror or error}") from error

@@ -183,9 +183,9 @@ def agent_order(label: str) -> tuple[int, str]:
     return known.index(agent) if agent in known else known.index(None), label
 
 
-def delay_order(delay: int | str) -> tuple[bool, int, str]:
-    """Sort delays: constant ones by length, then the others by name."""
-    return (True, 0, delay) if isinstance(delay, str) else (False, delay, "")
+def delay_order(delay: int | str | None) -> tuple[bool, bool, int, str]:
+    """Sort delays: constant ones by length, then the others by name, last None, which stands for all constant ones."""
+    return delay is None, isinstance(delay, str), delay if isinstance(delay, int) else 0, str(delay)
 
 
 def make_results(

@@ -135,6 +135,8 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
                         elif "run" not in row:  # of a run in such a file there may be more
                             raise KeyError
                     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+                        if number > 1 and not line.endswith(b"\n"):
+                            break  # a crash cut it, or it is being written
                         raise DelayRLError(f"{path}, line {number}: this is no row of results") from None
         except OSError as error:
             raise DelayRLError(f"{path} cannot be read: {error.strerror}") from error

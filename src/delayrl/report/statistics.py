@@ -177,10 +177,8 @@ def _resample(random: np.random.Generator, values: Floats) -> Floats:
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Floats:
     """Return the fraction of the scores, [..., runs], above each threshold, [T], as [..., T]."""
-    x, thresholds = np.sort(np.asarray(scores, float), axis=-1), np.asarray(thresholds, float)
-    flat = x.reshape(-1, x.shape[-1])
-    above = np.stack([x.shape[-1] - np.searchsorted(row, thresholds, side="right") for row in flat])
-    return (above / x.shape[-1]).reshape(*x.shape[:-1], thresholds.size)
+    x = np.asarray(scores, float)
+    return np.stack([(x > threshold).mean(-1) for threshold in np.asarray(thresholds, float)], -1)
 
 
 def common_steps(runs: Sequence[Mapping[int, float]]) -> tuple[NDArray[np.int64], Floats]:

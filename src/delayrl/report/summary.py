@@ -16,6 +16,7 @@ from delayrl.report.rows import RowGroup, group_rows
 from delayrl.report.statistics import Floats
 from delayrl.report.tables import Table, make_tables
 from delayrl.run.cell import Cell, Progress, Standing
+from delayrl.run.folder import versions_in
 
 THRESHOLDS = np.round(np.linspace(-0.25, 2.5, 56), 2)
 """At which normalised returns a performance profile is taken."""
@@ -48,6 +49,7 @@ class Summary:
     comparisons: list[Comparison]
     unplaced: int  # how many rows belong to no cell
     changed: list[str]  # tasks whose physics are not the same in all rows of one MuJoCo version
+    versions: list[Mapping[str, Any]]  # libraries, commits and hardware that the runs were trained with
 
     @property
     def settings(self) -> list[Setting]:
@@ -80,6 +82,7 @@ def summarise(
         DelayRLError: a row lacks a column, holds a value of another type, or is there twice; the rows of a cell are
             of several conditions.
     """
+    configs = list(configs)
     groups, known = group_rows(rows), by_key(configs)
     for group in groups:
         group.config = known.get(group.key, {})
@@ -94,9 +97,9 @@ def summarise(
             raise DelayRLError(f"the rows of cell {id} are of different things: {group_of[id].key} and {group.key}")
     labels, shared = _label_cells([cell for cell, _ in standing])
     results = make_results(standing, group_of, labels, inferred=inferred)
-    tables, every = make_tables(results), results.values()
-    changed = _changed_tasks([group for _, group in placed])
-    return Summary(results, shared, tables, _make_aggregates(every), make_comparisons(every), unplaced, changed)
+    every, changed = results.values(), _changed_tasks([group for _, group in placed])
+    made = make_tables(every), _make_aggregates(every), make_comparisons(every)
+    return Summary(results, shared, *made, unplaced, changed, [used for c in configs for used in versions_in(c)])
 
 
 def _changed_tasks(groups: Iterable[RowGroup]) -> list[str]:
@@ -193,7 +196,7 @@ def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
         whole = [label for label, tasks in tasks_of.items() if tasks == every]
         if len(whole) > 1 or len(results_of) == 1:
             aggregates += [_aggregate(setting, delay, label, results_of[label]) for label in whole]
-    return sorted(aggregates, key=_order)
+    return sorted(aggregates, key=lambda a: (a.setting, delay_order(a.delay), agent_order(a.label)))
 
 
 def _aggregate(setting: Setting, delay: int | str | None, label: str, results: list[Result]) -> Aggregate:
@@ -204,9 +207,3 @@ def _aggregate(setting: Setting, delay: int | str | None, label: str, results: l
     profile = statistics.performance_profile(pooled, THRESHOLDS)
     band = statistics.stratified_bootstrap(strata, lambda x: statistics.performance_profile(x, THRESHOLDS))
     return Aggregate(setting, delay, label, iqm, float(low), float(high), len(results), pooled.size, profile, *band)
-
-
-def _order(aggregate: Aggregate) -> tuple[Any, ...]:
-    """Each delay, then all constant delays together."""
-    delay = aggregate.delay
-    return aggregate.setting, delay is None, delay_order(0 if delay is None else delay), agent_order(aggregate.label)

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -11,7 +11,7 @@ from itertools import product
 from typing import Literal, NamedTuple
 
 from delayrl.report import statistics
-from delayrl.report.results import PAPER_ORDER, Place, Result, Setting, agent_order, delay_order
+from delayrl.report.results import PAPER_ORDER, Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import NAN
 
 Kind = Literal["normalised", "steps", "ablation", "stochastic"]
@@ -71,30 +71,30 @@ class Table:
     entries: dict[tuple[str, int | str, str], TableEntry]
 
 
-def make_tables(results: Mapping[Place, Result]) -> list[Table]:
+def make_tables(results: Collection[Result]) -> list[Table]:
     """Make the paper's tables, as far as the results reach."""
     tables = []
-    for setting in sorted({place.setting for place in results}):
-        learners = [r for r in results.values() if r.place.setting == setting and not r.is_anchor]
+    for setting in sorted({r.place.setting for r in results}):
+        learners = [r for r in results if r.place.setting == setting and not r.is_anchor]
         labels: dict[str, set[str]] = defaultdict(set)
         for result in learners:
             labels[result.condition.agent].add(result.place.label)
         varied = sorted(agent for agent, names in labels.items() if len(names) > 1)
         main = [r for r in learners if r.condition.agent not in varied or r.place.label == r.condition.agent]
         constant = [r for r in main if not isinstance(r.place.delay, str)]
-        tables.append(_table("normalised", "Normalised return, constant delays", setting, constant, results))
-        tables.append(_table("steps", "Steps to the delay-free return", setting, constant, results))
+        tables.append(_table("normalised", "Normalised return, constant delays", setting, constant))
+        tables.append(_table("steps", "Steps to the delay-free return", setting, constant))
         for agent in varied:
             variants = [r for r in learners if r.condition.agent == agent]
             compared = {(r.place.env, r.place.delay) for r in variants if r.place.label != agent}
             ablation = [r for r in variants if (r.place.env, r.place.delay) in compared]
-            tables.append(_table("ablation", f"Ablation of {agent}", setting, ablation, results))
+            tables.append(_table("ablation", f"Ablation of {agent}", setting, ablation))
         stochastic = [r for r in main if isinstance(r.place.delay, str)]
-        tables.append(_table("stochastic", "Normalised return, other delays", setting, stochastic, results))
+        tables.append(_table("stochastic", "Normalised return, other delays", setting, stochastic))
     return [table for table in tables if table.rows]
 
 
-def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], results: Mapping[Place, Result]) -> Table:
+def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Table:
     """Lay out the chosen results. The paper's columns are there only if all have its preset and budget."""
     rows = sorted({(r.place.env, r.place.delay) for r in chosen}, key=lambda row: (row[0], delay_order(row[1])))
     columns = {r.place.label for r in chosen}
@@ -104,10 +104,11 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result], resul
     if kind != "ablation" and any((env.removeprefix("delayrl/"), str(delay)) in in_paper for env, delay in rows):
         agents = {column.split(" ")[0] for column in columns}
         columns |= {agent for agent in PAPER_ORDER if agent not in agents}
-    conditions = {place.label: result.condition for place, result in results.items()}
+    at = {(r.place.env, r.place.delay, r.place.label): r for r in chosen}
+    conditions = {r.place.label: r.condition for r in chosen}
     entries = {}
     for (env, delay), label in product(rows, columns):
-        result = results.get(Place(setting, env, delay, label))
+        result = at.get((env, delay, label))
         condition = result.condition if result else conditions.get(label)
         overrides, agent = (condition.overrides, condition.agent) if condition else ({}, label)
         representation = str(overrides.get("representation", "transformer"))

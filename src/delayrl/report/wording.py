@@ -55,11 +55,6 @@ def threshold(result: Result) -> str:
     return f"{spread(*mean_std(anchor.smoothed))} ({anchor.source}, {anchor.steps:,} steps)"
 
 
-def reached(result: Result) -> str:
-    """Write the steps to the threshold, × if it was missed."""
-    return "×" if result.missed else steps(result.steps_to_threshold)
-
-
 def interval(bounds: tuple[float, float], write: Callable[[float], str]) -> str:
     """Write a 95 % interval, with × for a threshold that is not reached; empty if it is unknown, or reaches nothing."""
     low, high = bounds

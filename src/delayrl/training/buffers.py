@@ -21,7 +21,7 @@ XLA's allocation for such an update can exceed the 64 MB that glibc has room for
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
 
-def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
+def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> None:
     """Have the allocator keep the buffers of updates. Call it before JAX looks for its devices.
 
     XLA allocates an update's buffers at each call. glibc returns blocks above 32 MB to the system at once, and on
@@ -29,20 +29,18 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> bool:
     update's time. Asked to, it keeps blocks of up to 64 MB on any thread, larger ones on the main thread only. So large
     updates run there. That gives up computing beside the host's work, which costs small updates more than it saves.
 
-    Returns whether updates run on the main thread from now on, in this process: never without a glibc that can be
-    asked (2.35), off the main thread, or for small updates. No result depends on it.
+    It needs a glibc that can be asked (2.35). No result depends on it.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is None or not mallopt(MMAP_THRESHOLD, 2**26):  # an old glibc accepts no more than 32 MB
-        return False
+        return
     mallopt(TRIM_THRESHOLD, 2**27)
     on_main_thread = threading.current_thread() is threading.main_thread()
     if not on_main_thread or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
-        return False
+        return
     mallopt(MMAP_THRESHOLD, 2**30)
     mallopt(TRIM_THRESHOLD, 2**31 - 1)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    return True
 
 
 def product_bytes(agent: Agent, spec: Spec) -> list[int]:

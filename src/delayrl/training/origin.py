@@ -107,18 +107,14 @@ def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
 
 def parts_of(state: Arrays) -> dict[str, list[str]]:
     """Return what an agent has learned: the leaves of each network, and of each number such as a temperature."""
-    learned = {name: leaf for name, leaf in state.items() if is_learned(name, leaf)}
+    numbers = {name: leaf for name, leaf in state.items() if jnp.issubdtype(leaf.dtype, jnp.floating)}  # no counters
+    learned = {name: leaf for name, leaf in numbers.items() if "opt_state" not in name}
     parts: dict[str, list[str]] = {}
     for name in sorted(learned, key=lambda name: learned[name].ndim == 0):  # numbers last
         part = part_of(name)
         lone = learned[name].ndim == 0 and part not in parts
         parts.setdefault(name if lone else part, []).append(name)
     return parts
-
-
-def is_learned(name: str, leaf: Any) -> bool:
-    """Return whether a leaf of an agent's state is learned: it is no optimiser's, and no counter."""
-    return "opt_state" not in name and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def part_of(leaf: str) -> str:

@@ -38,8 +38,8 @@ SCALAR: dict[str, Callable[..., Any]] = {
     "sub": np.subtract,
     "mul": np.multiply,
     "rem": np.fmod,
-    "div": lambda a, b: np.trunc(a / b),  # of integers, as XLA rounds them
-    "convert_element_type": np.asarray,
+    "div": np.true_divide,
+    "convert_element_type": lambda x: np.multiply(x, 1),  # booleans become numbers
     "sign": np.sign,
     "min": np.minimum,
     "max": np.maximum,
@@ -112,7 +112,7 @@ def follow(program: Any, inputs: Sequence[Value] = ()) -> tuple[list[Product], l
             found, outputs = _follow_branches(params["branches"], *values)
             products += found
         elif name in SCALAR and all(x is not None for x in values):
-            outputs = [SCALAR[name](*values)] if equation.outvars[0].aval.shape == () else ()
+            outputs = [_computed(equation, *values)] if equation.outvars[0].aval.shape == () else ()
         else:
             for inside in _programs(list(params.values())):
                 once = name not in ("scan", "while") and len(inside.invars) == len(values)
@@ -122,6 +122,16 @@ def follow(program: Any, inputs: Sequence[Value] = ()) -> tuple[list[Product], l
                 products += [Product(p.equation, p.times * repeats) for p in found]
         known |= zip(equation.outvars, outputs, strict=bool(outputs))
     return products, [value(x) for x in program.outvars]
+
+
+def _computed(equation: Any, *values: Any) -> Value:
+    """Return the scalar that an operation gives. Known integers are rounded towards 0, as XLA does."""
+    name, result = equation.primitive.name, SCALAR[equation.primitive.name](*values)
+    given, made = equation.invars[0].aval.dtype, equation.outvars[0].aval.dtype
+    if name == "convert_element_type" and jnp.issubdtype(made, jnp.bool_):
+        return np.not_equal(result, 0)
+    rounded = name == "div" or jnp.issubdtype(given, jnp.floating)
+    return np.trunc(result) if rounded and jnp.issubdtype(made, jnp.integer) else result
 
 
 def _follow_branches(branches: Sequence[Any], index: Value, *inputs: Value) -> tuple[list[Product], list[Value]]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 SERVICES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 """Where metrics can be logged besides, and the module that this takes."""
@@ -12,22 +11,17 @@ class Tracker:
     """Writes scalars to one service from a step on; with `kind` None to nowhere."""
 
     def __init__(self, kind: str | None, path: Path, step: int):
-        self._write: Any = None
+        self.write: Callable[[int, dict[str, float]], object] = lambda step, values: None
         self.close: Callable[[], object] = lambda: None
         if kind == "tensorboard":
             from tensorboardX import SummaryWriter
 
             writer = SummaryWriter(str(path / "tensorboard"), purge_step=step)  # a stopped run may have been further
             self.close = writer.close
-            self._write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
+            self.write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
         elif kind == "wandb":
             import wandb
 
             run = wandb.init(project="delayrl", name=str(path), dir=str(path), reinit="create_new")
             self.close = run.finish
-            self._write = lambda step, values: run.log(values, step=step)
-
-    def write(self, step: int, values: dict[str, float]) -> None:
-        """Log scalars at an environment step."""
-        if self._write is not None:
-            self._write(step, values)
+            self.write = lambda step, values: run.log(values, step=step)

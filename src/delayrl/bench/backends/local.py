@@ -110,7 +110,7 @@ def free_core(own: Mapping[int, int | None]) -> int | None:
         return None
     taken = Counter(own.values())
     for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended
+        with contextlib.suppress(OSError, ValueError):  # it has ended, or is no worker
             words = (process / "cmdline").read_bytes().split(b"\0")
             if b"delayrl.bench.worker" in words and b"--core" in words and int(process.name) not in own:
                 taken[int(words[words.index(b"--core") + 1])] += 1
