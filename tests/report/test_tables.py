@@ -150,6 +150,17 @@ def test_the_papers_row_shows_its_number() -> None:
     assert "and its steps are noted" in text
 
 
+def test_other_settings_leave_the_paper_where_it_is() -> None:
+    """A variant with another preset takes no published value from an empty place of the paper's."""
+    cells = [standing("vdpo", "delayrl/Ant-v4", 25), standing("bpql", "delayrl/Ant-v4", 50)]
+    other = standing("vdpo", "delayrl/HalfCheetah-v4", 25, preset="small", overrides={"discount": 0.9})
+    for more in ([], [other]):
+        (table,) = (
+            t for t in summarise([], cells + more).tables if (t.kind, t.setting.preset) == ("normalised", "paper")
+        )
+        assert table.entries["delayrl/Ant-v4", 50, "vdpo"].published is not None
+
+
 def test_published_values() -> None:
     values = published_values()
     assert len(values) == 162 + 162 + 27 + 54
