@@ -59,11 +59,11 @@ def section(files: list[Path], pictures: Path) -> str:
     steps = f"{', '.join(others)} and {last}"
     made = (
         f"Δ is the delay in steps. Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other "
-        "number is given. In brackets is the 95 % interval of the normalised return, below it the raw return at the end "
-        "± the standard deviation over seeds; a seed's return is a mean of ten episodes. † acts on the true state while it "
-        "trains. ° has rows from before a mistake was fixed, of which more below. VDPO has `--tokens 1280`. Any-age's "
-        "critics have layer normalisation, and with `critic_norm=layer` those of SAC and BPQL; those of VDPO, lifting "
-        f"and A-SAC have none. {made_on(used)} {rows_of(files, tables)}"
+        "number is given. In brackets is the 95 % interval of the normalised return, below it the raw return at the "
+        "end ± the standard deviation over seeds; a seed's return is a mean of ten episodes. † acts on the true state "
+        "while it trains. ° has rows from before a mistake was fixed, of which more below. VDPO has `--tokens 1280`. "
+        "Any-age's critics have layer normalisation, and with `critic_norm=layer` those of SAC and BPQL; those of "
+        f"VDPO, lifting and A-SAC have none. {made_on(used)} {rows_of(files, tables)}"
     )
     return f"{table(chosen, older(files))}\n\n{made}"
 
