@@ -332,7 +332,8 @@ def main() -> None:
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2", "any-age-ladder")]
     insert(root / "docs" / "which-agent.md", "which", which.section([file for file in rows if file.exists()]))
     for key, text in speed.pages(root).items():
-        insert(root / "docs" / "performance.md", key, text)
+        details = key in ("speed-floors", "speed-operations")
+        insert(HERE / "speed" / "README.md" if details else root / "docs" / "performance.md", key, text)
 
 
 if __name__ == "__main__":

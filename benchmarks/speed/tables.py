@@ -313,7 +313,7 @@ PEERS = ("torch", "jax", "stable_baselines3", "sbx_rl")
 
 
 def pages(root: Path) -> dict[str, str]:
-    """Return the generated sections of docs/performance.md by key, and draw its picture."""
+    """Return the generated sections of docs/performance.md and of README.md here by key, and draw their picture."""
     every = read_rows()
     if not every:
         return {}
