@@ -48,12 +48,24 @@ COLOURS = {
     "any-age": "#8250df",
 }
 
+DETAILS = ("speed-floors", "speed-operations")
+"""Sections about speed for those who work on it, in speed/README.md."""
+
 
 def read(name: str) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
     """Return configurations by run, rows, and evaluations of a results file."""
     lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
     configs = {line["run"]: line["config"] for line in lines if "config" in line}
     return configs, [line for line in lines if "step" in line], [line for line in lines if "evaluation" in line]
+
+
+def evaluations(name: str) -> dict[str, list[tuple[dict[str, Any], dict[str, Any]]]]:
+    """Return (configuration, evaluation on unseen start states) of each run, by agent."""
+    configs, _, lines = read(name)
+    result: dict[str, list[tuple[dict[str, Any], dict[str, Any]]]] = defaultdict(list)
+    for line in lines:
+        result[line["evaluation"]["agent"]].append((configs[line["run"]], line["evaluation"]))
+    return result
 
 
 def table(name: str) -> str:
@@ -95,12 +107,9 @@ def provenance(name: str) -> str:
     commits = sorted({config["versions"]["commit"] or "?" for config in configs.values()})
     episodes = lines[0]["evaluation"]["episodes"] if lines else 0
     return (
-        f"Each return is the mean of {episodes} episodes on start states that the run never saw, the same for all, and "
-        f"that of `random` of all its evaluations, raw; protocol "
-        f"`{configs[0]['protocol']}`, preset `{configs[0]['preset']}`; {versions['cores']} x86 cores, "
+        f"{episodes} episodes a seed; preset `{configs[0]['preset']}`; {versions['cores']} x86 cores, "
         f"jax {versions['jax']}, MuJoCo {versions['mujoco']}, Gymnasium {versions['gymnasium']}, "
-        f"commit {', '.join(commits)}. The interval of three seeds is "
-        "their range, with that of the anchors' seeds, which holds the true mean in about 75 of 100 cases. "
+        f"commit {', '.join(commits)}. "
         f"Rows: `benchmarks/results/{name}.jsonl`."
     )
 
@@ -332,8 +341,7 @@ def main() -> None:
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2", "any-age-ladder")]
     insert(root / "docs" / "which-agent.md", "which", which.section([file for file in rows if file.exists()]))
     for key, text in speed.pages(root).items():
-        details = key in ("speed-floors", "speed-operations")
-        insert(HERE / "speed" / "README.md" if details else root / "docs" / "performance.md", key, text)
+        insert(HERE / "speed" / "README.md" if key in DETAILS else root / "docs" / "performance.md", key, text)
 
 
 if __name__ == "__main__":

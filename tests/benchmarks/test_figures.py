@@ -1,0 +1,42 @@
+"""The generated sections of the pages are what `benchmarks/figures.py` writes from the committed rows."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import figures  # noqa: E402
+
+
+def section(page: str, key: str) -> str:
+    """What stands between the marks of a section."""
+    return (ROOT / page).read_text().split(f"<!-- {key} -->\n")[1].split(f"\n<!-- /{key} -->")[0]
+
+
+@pytest.mark.parametrize("name", ["pendulum", "reacher", "walk", "walk-random", "pusher-random"])
+def test_small_comparisons(name: str) -> None:
+    assert section("docs/benchmarks.md", name) == f"{figures.table(name)}\n\n{figures.provenance(name)}"
+
+
+def test_tables_of_one_file_each() -> None:
+    assert section("docs/protocols.md", "entropies") == figures.entropies("pusher-entropy")
+    assert section("docs/delays.md", "overhead") == figures.overhead()
+    for key, write in (
+        ("udp", figures.udp_table),
+        ("overruns", figures.overruns_table),
+        ("younger", figures.younger_table),
+    ):
+        lines = (ROOT / "benchmarks" / "results" / f"{key}.jsonl").read_text().splitlines()
+        assert section("docs/runtime.md", key) == write([json.loads(line) for line in lines])
+
+
+def test_speed(tmp_path: Path) -> None:
+    (tmp_path / "docs" / "img").mkdir(parents=True)
+    for key, text in figures.speed.pages(tmp_path).items():
+        page = "benchmarks/speed/README.md" if key in figures.DETAILS else "docs/performance.md"
+        assert section(page, key) == text, key
+    assert (tmp_path / "docs" / "img" / "performance-sizes.png").stat().st_size > 10_000
