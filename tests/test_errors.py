@@ -2,8 +2,7 @@
 
 import pytest
 
-from delayrl.errors import DelayRLError, described, first_line, near_names, needs_extra
-from delayrl.lookup import one_line
+from delayrl.errors import DelayRLError, described, first_line, near_names, needs_extra, one_line
 
 
 def test_first_lines() -> None:

@@ -24,6 +24,8 @@ class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
 
 
+LONGEST_LINE = 1_000
+"""Characters of another library's message that are shown."""
 TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL", "scipy")
 """Modules that the extra `train` brings."""
 
@@ -78,8 +80,9 @@ def near_names(name: str, known: Iterable[str]) -> list[str]:
 
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type where the message is empty."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return "".join(filter(str.isprintable, lines[0]))
+    printable = "".join(c if c.isprintable() or c in "\r\n" else " " for c in str(error)).strip()
+    line = printable.splitlines()[0] if printable else type(error).__name__
+    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE - 1]}…"
 
 
 def described(error: BaseException) -> str:

@@ -40,3 +40,26 @@ def test_speed(tmp_path: Path) -> None:
         page = "benchmarks/speed/README.md" if key in figures.DETAILS else "docs/performance.md"
         assert section(page, key) == text, key
     assert (tmp_path / "docs" / "img" / "performance-sizes.png").stat().st_size > 10_000
+
+
+def tables(*names: str) -> list[Path]:
+    return [ROOT / "benchmarks" / "results" / f"{name}.sqlite" for name in names]
+
+
+def test_the_result(tmp_path: Path) -> None:
+    """On both first pages, with the parts of any-age and lost episodes."""
+    result = figures.front.section(tables("evidence-1", "evidence-2", "any-age-ladder"), tmp_path)
+    assert section("README.md", "result") == section("docs/index.md", "result") == result
+    arms, goals = figures.ladder.sections(tables("any-age-ladder"), tmp_path / "ladder.png")
+    assert section("docs/algorithms/any-age.md", "ladder") == arms
+    assert section("docs/algorithms/any-age.md", "goals") == goals
+
+
+@pytest.mark.thorough
+def test_comparisons(tmp_path: Path) -> None:
+    rows = tables("evidence-1", "evidence-2", "any-age-ladder")
+    assert section("docs/algorithms/any-age.md", "against") == figures.against.section(rows)
+    poles = figures.against.section(rows, "InvertedDoublePendulum-v5")
+    assert section("docs/algorithms/any-age.md", "against-poles") == poles
+    assert section("docs/which-agent.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
+    assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])

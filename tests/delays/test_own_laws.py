@@ -65,6 +65,20 @@ def test_an_own_law_is_played_as_ours() -> None:
     assert_alike(delayrl.make("Pendulum-v1", observed), delayrl.make("Pendulum-v1", 3))
 
 
+def test_its_state_is_its_own() -> None:
+    """Whatever it keeps between two messages comes back, also where the actions are late by a constant."""
+
+    class Memory:
+        maximum = 3
+
+        def draw(self, state: Any, random: np.random.Generator) -> tuple[int, Any]:
+            seen = state or ()
+            return len(seen), (*seen, 0.5)
+
+    observed = Delay(Memory(), action=2).observed()  # type: ignore[arg-type]
+    assert drawn(observed.observation.law, 4) == [2, 3, 4, 5]
+
+
 def test_what_an_episode_draws_of_an_own_law_is_checked() -> None:
     law = PerEpisode(Wrong())
     assert str(law) == "episode:<Wrong:1>"

@@ -14,6 +14,7 @@ from synthetic import rows, small, standing, two_lengths
 from delayrl.errors import DelayRLError
 from delayrl.report import figures
 from delayrl.report.__main__ import main
+from delayrl.report.configurations import read_configs
 from delayrl.report.report import report
 from delayrl.report.rows import read_rows
 from delayrl.report.summary import summarise
@@ -105,6 +106,14 @@ def test_a_line_that_a_crash_cut_is_left_out(tmp_path: Path) -> None:
     whole = json.dumps({name: "x" for name in CONDITION} | {"step": 1})
     (tmp_path / "rows.jsonl").write_text(f'{whole}\n{{"agent": "sac", "st')
     assert [row["step"] for row in read_rows([tmp_path / "rows.jsonl"])] == [1]
+    collected = tmp_path / "collected" / "rows.jsonl"
+    collected.parent.mkdir()
+    collected.write_text(f'{whole}\n{{"run": 3, "config": {{"agent": "s')
+    assert (len(list(read_rows([collected]))), list(read_configs([collected]))) == (1, [])
+    for last in ("[1, 2]", '{"agent": "sac"}'):  # whole, but no row
+        collected.write_text(f"{whole}\n{last}")
+        with pytest.raises(DelayRLError, match="line 2: this is no row"):
+            list(read_rows([collected]))
     (tmp_path / "rows.jsonl").write_text(f'{whole}\n{{"agent": "sac", "st\n')
     with pytest.raises(DelayRLError, match="line 2: this is no row"):
         list(read_rows([tmp_path / "rows.jsonl"]))

@@ -109,13 +109,15 @@ def test_booleans_and_fractions_of_the_count() -> None:
     def program(count: jax.Array) -> jax.Array:
         even, third = ((count % n == 0).astype(jnp.int32) for n in (2, 3))
         gates = (even + third == 2, even - third < 0, count / 10 < 0.5, (count / 10).astype(jnp.int32) == 1)
-        gates += ((even - third).astype(bool), (count - 20) // 7 == -2)
+        gates += ((even - third).astype(bool), (count - 20) // 7 == -2, ((count // 10) & 1) == 1)
+        gates += (((count / 10).astype(jnp.int32) | 1) == 1, ~(count // 10) == -2, (count * 20).astype(jnp.uint8) < 100)
         return sum(jax.lax.cond(gate, lambda: (x @ x.T).sum(), lambda: 0.0) for gate in gates)
 
     counts = np.arange(24)
     products, _ = follow(jax.make_jaxpr(program)(jnp.int32(0)).jaxpr, [counts])
     even, third = counts % 2 == 0, counts % 3 == 0
     gates = (even & third, third & ~even, counts < 5, counts // 10 == 1, even != third, (counts - 20) // 7 == -2)
+    gates += (counts // 10 == 1, counts < 20, counts // 10 == 1, counts * 20 % 256 < 100)
     assert [p.flops for p in products] == [pytest.approx(24 * gate.mean()) for gate in gates]
 
 

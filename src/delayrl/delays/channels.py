@@ -7,7 +7,7 @@ from itertools import accumulate
 from typing import Literal, get_args
 
 from delayrl.delays import laws
-from delayrl.delays.episodes import OURS, PerEpisode, Sum
+from delayrl.delays.episodes import OURS, PerEpisode, Sum, later
 from delayrl.delays.laws import Constant, DelayLaw
 from delayrl.delays.own import own_law
 from delayrl.errors import DelayRLError
@@ -122,10 +122,11 @@ class Delay:
             )
         if not self.action.maximum:
             return Delay(self.observation)
-        if self.observation.constant and self.action.constant:
-            return Delay(Channel(Constant(self.maximum)))
-        law, lag = (Constant(side.maximum) if side.constant else side.law for side in (self.observation, self.action))
-        return Delay(Channel(Sum(law, lag), "newest" if self.observation.constant else self.observation.rule))
+        if self.action.constant:
+            return Delay(replace(self.observation, law=later(self.observation.law, self.action.maximum)))
+        if self.observation.constant:
+            return Delay(Channel(later(self.action.law, self.observation.maximum)))
+        return Delay(replace(self.observation, law=Sum(self.observation.law, self.action.law)))
 
     def acted(self) -> "Delay":
         """Remove the delay of the rewards, as evaluation and deployment do."""

@@ -1,7 +1,7 @@
 """Delays that differ between episodes: drawn once in each, or left open by a sensor that runs on its own clock."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,6 +53,9 @@ class Sum:
 
     def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
         """Draw both; the state holds those of both laws."""
+        if isinstance(self.lag, Constant):
+            travel, state = self.law.draw(state, random)
+            return travel + self.lag.steps, state
         states = self.lag.maximum + 2  # 0 before the first message, then 1 plus a delay
         state, of_lag = divmod(state, states)
         lag, of_lag = self.lag.draw(of_lag, random)
@@ -62,6 +65,20 @@ class Sum:
 
 OURS = (Constant, laws.Choice, laws.Markov, laws.Recorded, PerEpisode, Sum, OwnLaw)
 """All classes of laws. Others are a user's, which `own_law` makes one of these."""
+
+
+def later(law: DelayLaw, steps: int) -> DelayLaw:
+    """Return the law whose travel times are longer by `steps`."""
+    match law:
+        case Constant():
+            return Constant(law.steps + steps)
+        case laws.Choice() | laws.Markov():
+            return replace(law, steps=tuple(s + steps for s in law.steps), name="")
+        case laws.Recorded():
+            return replace(law, steps=tuple(s + steps for s in law.steps))
+        case PerEpisode():
+            return PerEpisode(later(law.law, steps))
+    return Sum(law, Constant(steps))
 
 
 def any_phase(shortest: float, longest: float, period: float = 1.0) -> tuple[int, int]:

@@ -77,7 +77,8 @@ def _made(task: Task, options: dict[str, Any]) -> Any:
     try:
         return task.make(**options)
     except DelayRLError as error:
-        near = [ours for name in options for ours in near_names(name, inspect.signature(make).parameters)]
+        own = [p.name for p in inspect.signature(make).parameters.values() if p.kind is p.KEYWORD_ONLY]
+        near = [ours for name in options for ours in near_names(name, own)]
         if near and isinstance(error.__cause__, TypeError):
             raise DelayRLError(f"{error}; did you mean {', '.join(near)}?") from error.__cause__
         raise

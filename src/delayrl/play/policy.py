@@ -41,6 +41,7 @@ class Policy:
         spec: Spec,
         low: NDArray[Any],
         high: NDArray[Any],
+        *,
         step: int | None = None,
         trained: Delay | None = None,
     ) -> None:
@@ -146,7 +147,7 @@ def restored(
         if not instead:
             raise
         raise DelayRLError(f"the run does not fit the {' and the '.join(instead)} given: {error}") from error
-    return Policy(agent, state, spec, actions.low, actions.high, checkpoint.step, trained)
+    return Policy(agent, state, spec, actions.low, actions.high, step=checkpoint.step, trained=trained)
 
 
 def spec_of(env: Any) -> Spec:

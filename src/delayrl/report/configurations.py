@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from delayrl.errors import DelayRLError
-from delayrl.report.rows import Key, RowGroup
+from delayrl.report.rows import Key, RowGroup, whole_lines
 from delayrl.run.condition import Condition, overrides_of
 from delayrl.run.folder import RunFolder, check_more
 
@@ -24,7 +24,8 @@ def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
             yield RunFolder(path.parent).config
             continue
         try:
-            lines = [line for line in path.read_bytes().splitlines() if b'"config"' in line]
+            with open(path, "rb") as file:
+                lines = [line for _, line in whole_lines(file) if b'"config"' in line]
             configs = [line["config"] for line in map(json.loads, lines) if "config" in line]
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise DelayRLError(f"{path} cannot be read: {error}") from error

@@ -112,6 +112,17 @@ def _group(row: Mapping[str, Any]) -> RowGroup:
     return RowGroup(cell, condition, configuration, row.get("privileged") is True)
 
 
+def whole_lines(file: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Yield lines with their numbers, without a last one that a crash cut, or that is being written."""
+    for number, line in enumerate(file, 1):
+        if number > 1 and not line.endswith(b"\n"):
+            try:
+                json.loads(line)
+            except ValueError:
+                return
+        yield number, line
+
+
 def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
     """Yield the rows of rows.jsonl files, and of files that `benchmarks/collect.py` wrote.
 
@@ -122,7 +133,7 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
         runs: dict[Any, list[Row]] = defaultdict(list)
         try:
             with open(path, "rb") as file:
-                for number, line in enumerate(file, 1):
+                for number, line in whole_lines(file):
                     try:
                         row = json.loads(line)
                         if not isinstance(row, dict):
@@ -135,8 +146,6 @@ def read_rows(paths: Iterable[Path]) -> Iterator[Row]:
                         elif "run" not in row:  # of a run in such a file there may be more
                             raise KeyError
                     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-                        if number > 1 and not line.endswith(b"\n"):
-                            break  # a crash cut it, or it is being written
                         raise DelayRLError(f"{path}, line {number}: this is no row of results") from None
         except OSError as error:
             raise DelayRLError(f"{path} cannot be read: {error.strerror}") from error

@@ -125,13 +125,20 @@ def follow(program: Any, inputs: Sequence[Value] = ()) -> tuple[list[Product], l
 
 
 def _computed(equation: Any, *values: Any) -> Value:
-    """Return the scalar that an operation gives. Known integers are rounded towards 0, as XLA does."""
-    name, result = equation.primitive.name, SCALAR[equation.primitive.name](*values)
-    given, made = equation.invars[0].aval.dtype, equation.outvars[0].aval.dtype
-    if name == "convert_element_type" and jnp.issubdtype(made, jnp.bool_):
-        return np.not_equal(result, 0)
-    rounded = name == "div" or jnp.issubdtype(given, jnp.floating)
-    return np.trunc(result) if rounded and jnp.issubdtype(made, jnp.integer) else result
+    """Return the scalar that an operation gives, of its type where it is known; None if NumPy has no such operation."""
+    name, made = equation.primitive.name, equation.outvars[0].aval.dtype
+    try:
+        result = np.asarray(SCALAR[name](*values))
+    except TypeError:  # such as bits of a mean over branches
+        return None
+    if jnp.issubdtype(made, jnp.bool_):
+        return result != 0
+    if not jnp.issubdtype(made, jnp.integer):
+        return result
+    if name == "div" or jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating):
+        result = np.trunc(result)  # towards 0, as XLA does
+    exact = np.isfinite(result) & (result == np.trunc(result))
+    return result.astype(np.int64).astype(made) if exact.all() else result
 
 
 def _follow_branches(branches: Sequence[Any], index: Value, *inputs: Value) -> tuple[list[Product], list[Value]]:

@@ -59,10 +59,12 @@ class Graph:
 
 
 def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) -> bytes:
-    """Return the serialised model."""
-    import onnx
-    from onnx import TensorProto, helper
-
+    """Return the serialised model. Raises DelayRLError if the package `onnx` is not installed."""
+    try:
+        import onnx
+        from onnx import TensorProto, helper
+    except ImportError as error:
+        raise DelayRLError("exporting a policy needs the package onnx: pip install 'delayrl[deploy]'") from error
     graph = Graph()
     low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
     delayed = graph("Greater", "age", graph.constant(0, np.int64))
