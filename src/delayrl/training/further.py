@@ -94,11 +94,11 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
     origin = dict(config.get("origin", {}))
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]
-    known = config.get("unnamed", {})
+    unnamed = config.get("unnamed", {})
     for part in ("agent", "env"):
-        if part in known and setup.unnamed.get(part, known[part]) != known[part]:
+        if part in unnamed and setup.unnamed.get(part, unnamed[part]) != unnamed[part]:
             raise DelayRLError(f"a run goes on with its own {part}; that which is given holds something else")
-    setup = replace(setup, origin=origin, unnamed=known)
+    setup = replace(setup, origin=origin, unnamed=unnamed)
     names = {"agent": config["agent"], "env": config["env"]}  # its rows name what it began with
     return replace(setup, condition=replace(setup.condition, **names, overrides=overrides_of(setup.config)))
 
@@ -107,8 +107,7 @@ def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], 
     """Raise DelayRLError unless a run can go on to `steps` steps beside the first of its group."""
     good, _ = run.checkpoints()
     checkpoint = good[0] if good else run.latest()
-    if steps < max(checkpoint.step, config["schedule"]["steps"]):
-        least = max(checkpoint.step, config["schedule"]["steps"])
+    if steps < (least := max(checkpoint.step, config["schedule"]["steps"])):
         raise DelayRLError(f"{run.path} has {least:,} steps; to train it further, give more than that: got {steps:,}")
     if steps > checkpoint.step:
         hint = f"--from {run.path} starts a new run with its networks"
