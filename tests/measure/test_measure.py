@@ -653,6 +653,10 @@ def test_parquet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parquet.write_table(pyarrow.table({"timestamp": ROW * np.arange(len(u)), **vectors}), path)
     e = from_log(path)
     assert (e.in_step, e.peak.command, e.peak.observation) == ("5", "action[0]", "observation.state[0]")
+    uneven = {"timestamp": [0.0, 0.1, 0.2], "action": [[1.0, 0.0], [1.0], [1.0, 0.0]], "observation": [0.0, 1.0, 2.0]}
+    parquet.write_table(pyarrow.table(uneven), tmp_path / "uneven.parquet")
+    with pytest.raises(DelayRLError, match="row 2: column action has 1 numbers, in the row before 2; drop such rows"):
+        from_log(tmp_path / "uneven.parquet")
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(DelayRLError, match="damaged"):
         from_log(path)

@@ -110,7 +110,7 @@ def test_a_line_that_a_crash_cut_is_left_out(tmp_path: Path) -> None:
     collected.parent.mkdir()
     collected.write_text(f'{whole}\n{{"run": 3, "config": {{"agent": "s')
     assert (len(list(read_rows([collected]))), list(read_configs([collected]))) == (1, [])
-    for last in ("[1, 2]", '{"agent": "sac"}'):  # whole, but no row
+    for last in ("[1, 2]", '{"agent": "sac"}', "[" * 100_000):  # whole or deep, but no row
         collected.write_text(f"{whole}\n{last}")
         with pytest.raises(DelayRLError, match="line 2: this is no row"):
             list(read_rows([collected]))

@@ -176,7 +176,7 @@ class Table:
         except (TypeError, ValueError):
             sizes = [np.size(cell) for cell in cells]
             if row := next((i for i, size in enumerate(sizes) if size != sizes[0]), 0):
-                counts = f"{sizes[row]} numbers, and that before {sizes[row - 1]}"
+                counts = f"{sizes[row]} numbers, in the row before {sizes[row - 1]}"
                 raise DelayRLError(f"{self.path}, row {row + 1}: column {name} has {counts}; drop such rows") from None
             row = next((i for i, cell in enumerate(cells) if not _number(cell)), 0)
             shown = "an empty cell" if cells[row] in ("", None) else f"{cells[row]!r}, which is not a number"
