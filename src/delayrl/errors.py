@@ -24,8 +24,6 @@ class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
 
 
-LONGEST_LINE = 1_000
-"""Characters of another library's message that are shown."""
 TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL", "scipy")
 """Modules that the extra `train` brings."""
 
@@ -81,8 +79,7 @@ def near_names(name: str, known: Iterable[str]) -> list[str]:
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of its type where the message is empty."""
     printable = "".join(c if c.isprintable() or c in "\r\n" else " " for c in str(error)).strip()
-    line = printable.splitlines()[0] if printable else type(error).__name__
-    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE - 1]}…"
+    return printable.splitlines()[0] if printable else type(error).__name__
 
 
 def described(error: BaseException) -> str:
@@ -92,11 +89,11 @@ def described(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def one_line(what: str) -> Iterator[None]:
-    """Raise whatever code of the user raises as a DelayRLError: `what`, and the error's own type and message."""
+def one_line(what: str, longest: int | None = None) -> Iterator[None]:
+    """Raise what other code raises as a DelayRLError: `what`, and the type and message, cut at `longest` characters."""
     try:
         yield
     except DelayRLError:
         raise
     except (Exception, SystemExit) as error:  # a script without a guard may end the process when it is imported
-        raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)}")) from error
+        raise (needs_extra(error) or DelayRLError(f"{what}: {described(error)[:longest]}")) from error

@@ -10,6 +10,8 @@ from delayrl.deploy.files import DOCUMENT, GRAPH, LIMITS, WEIGHTS, check_files, 
 from delayrl.errors import DelayRLError, one_line
 
 CARD = "README.md"
+LONGEST_MESSAGE = 200
+"""Characters that are shown of what a server says."""
 
 
 def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
@@ -26,7 +28,7 @@ def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
     metadata, files = read_files(bundle, (WEIGHTS, GRAPH))
     check_files(bundle, metadata, files)
     hub, api = _hub()
-    with one_line(f"cannot push to {repo}"):
+    with one_line(f"cannot push to {repo}", LONGEST_MESSAGE):
         url = api.create_repo(repo, private=private, exist_ok=True)
         content = {CARD: card(metadata, repo).encode(), **files}
         operations: list[Any] = [hub.CommitOperationAdd(name, data) for name, data in content.items()]
@@ -52,7 +54,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
     _, api = _hub()
     names = [DOCUMENT, WEIGHTS, GRAPH]
     with tempfile.TemporaryDirectory(prefix="delayrl-pull-") as folder:
-        with one_line(f"cannot pull from {repo}"):
+        with one_line(f"cannot pull from {repo}", LONGEST_MESSAGE):
             revision = api.repo_info(repo, revision=revision).sha  # what is checked is what is downloaded
             paths = api.get_paths_info(repo, names, revision=revision)
             sizes = {path.path: getattr(path, "size", None) for path in paths}
@@ -60,7 +62,7 @@ def pull(repo: str, out: str | Path, *, revision: str | None = None, force: bool
             size = sizes[name]
             if not isinstance(size, int) or size > LIMITS[name]:
                 raise DelayRLError(f"{name} in {repo} is not a file, or is larger than {LIMITS[name]:,} bytes")
-            with one_line(f"cannot pull {name} from {repo}"):
+            with one_line(f"cannot pull {name} from {repo}", LONGEST_MESSAGE):
                 api.hf_hub_download(repo, name, revision=revision, local_dir=folder)
         if DOCUMENT not in sizes:
             raise DelayRLError(f"{repo} holds no policy bundle: it has no {DOCUMENT}")
