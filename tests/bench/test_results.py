@@ -346,7 +346,9 @@ def test_worker(finished, tmp_path: Path) -> None:
     assert work_on(wrong, tmp_path).kind == "failed"
     assert "longer than an episode" in work(tmp_path / wrong.folder).line
     (tmp_path / wrong.folder / "cell.json").write_text("{")
-    assert work(tmp_path / wrong.folder).kind == "died"
+    assert work(tmp_path / wrong.folder).kind == "failed"  # as a mistake in somebody's agent: it would come back
+    (tmp_path / wrong.folder / "cell.json").unlink()
+    assert work(tmp_path / wrong.folder).kind == "died"  # as where a disk does not answer
 
 
 def test_commands(finished, tmp_path: Path, capsys, monkeypatch) -> None:

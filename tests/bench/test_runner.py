@@ -97,7 +97,7 @@ def test_time_limit(tmp_path: Path) -> None:
             assert "0 of 2 cells done" in said
             assert "the same command resumes it" in said
             now = [p for _, p in standing(cells, runs)]
-            assert [p.state for p in now] == ["todo", "todo"]
+            assert [p.state for p in now] == ["begun" if p.step else "todo" for p in now]
             before, reached = reached, sum(p.step for p in now)
             assert reached >= before
             if reached > before:
@@ -120,6 +120,7 @@ def test_stopped_or_killed_runner(tmp_path: Path) -> None:
         assert process.returncode == status
         until(lambda: folders.holder(runs / cell.folder) is None)
         assert folders.journal(runs / cell.folder)[-1]["event"] == "stopped"
+        assert standing([cell], runs)[0][1].state == "begun"
 
 
 def until(condition, timeout: float = 120) -> None:

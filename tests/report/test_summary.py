@@ -227,6 +227,7 @@ def test_a_failed_seed_beside_one_that_has_ended() -> None:
     summary = summarise(anchored(cells, vdpo=[[0.0, 1, 60]]), [*cells.values(), failed, todo])
     entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
     assert entry.note == "1 of 3 seeds · failed at 100 of 300 steps"
+    assert of(summarise(anchored(cells, vdpo=[[0.0, 1, 60]]), [*cells.values(), todo]), "vdpo").unfinished == "begun"
 
 
 def test_over_all_delays_conditions_are_counted() -> None:

@@ -1,7 +1,7 @@
 """Run cells: which starts next, what is tried again, when to stop. A `Backend` says where they run.
 
 A worker that dies is started again and resumes from its checkpoint. Only tries in a row that store nothing new count,
-so a long cell may be interrupted any number of times. A DelayRLError is not tried again: it would come back.
+so a long cell may be interrupted any number of times. An error that would come back is not tried again.
 """
 
 import contextlib

@@ -25,7 +25,7 @@ def progress(cell: Cell, runs: Path) -> Progress:
         return Progress("done", step, speed)
     if events and events[-1]["event"] == "failed":
         return Progress("failed", step, speed, str(events[-1].get("line", "")))
-    return Progress("todo", step, speed)
+    return Progress("begun" if step else "todo", step, speed)
 
 
 def standing(cells: Sequence[Cell], runs: Path) -> list[tuple[Cell, Progress]]:
@@ -40,7 +40,7 @@ def seconds_left(standing: Standing, workers: int) -> float | None:
     task and delay, else the same agent and task, else the same agent, else all.
     """
     measured = [(cell, p.speed) for cell, p in standing if p.speed]
-    unfinished = [(cell, p) for cell, p in standing if p.state in ("todo", "running")]
+    unfinished = [(cell, p) for cell, p in standing if p.state not in ("done", "failed")]
     if not unfinished:
         return 0.0
     if not measured:

@@ -57,7 +57,8 @@ def work(folder: Path, device: str | None = None) -> Outcome:
         return Outcome("failed", str(error))
     except Exception as error:
         _log(traceback.format_exc())
-        return Outcome("died", described(error))
+        # another try may find more memory or a disk that answers (JAX's errors are RuntimeErrors), but the same mistake
+        return Outcome("died" if isinstance(error, OSError | MemoryError | RuntimeError) else "failed", described(error))
 
 
 def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:

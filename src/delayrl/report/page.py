@@ -96,7 +96,6 @@ def _result(r: Result, names: Names) -> dict[str, Any]:
         "agent": names["agents"].index(r.place.label),
         "status": r.progress.state,
         "progress": r.unfinished or r.progress.state,
-        "running": r.progress.state == "running",
         "partial": r.partial,
         "isAnchor": r.is_anchor,
         "runs": r.runs,

@@ -112,7 +112,7 @@ class Result:
             word = "failed at" if state == "failed" else "at"
             seen = self.curves.steps[-1:].tolist() if self.partial else []  # else those are of seeds that have ended
             return f"{word} {max([self.progress.step, *seen]):,} of {self.condition.steps:,} steps"
-        return state if state == "running" else ""
+        return state if state in ("begun", "running") else ""
 
     @property
     def final(self) -> Floats:
@@ -250,12 +250,14 @@ def _hours(progress: Sequence[Progress]) -> float:
 
 
 def _state(states: set[CellState], has_rows: bool) -> CellState:
-    """The worst of several cells' states. Some seeds done and others not is running."""
+    """The worst of several cells' states. Some seeds done and others not is begun."""
     if "failed" in states:
         return "failed"
     if states == {"done"}:
         return "done"
-    return "running" if "running" in states or has_rows else "todo"
+    if "running" in states:
+        return "running"
+    return "begun" if "begun" in states or has_rows else "todo"
 
 
 def _anchored(result: Result, others: Sequence[Result]) -> Result:

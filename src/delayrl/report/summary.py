@@ -123,7 +123,7 @@ def _infer_cells(groups: Sequence[RowGroup]) -> tuple[Standing, Placed]:
         end = max(*steps, group.config["schedule"]["steps"] if group.config else 0)
         id = repr((None, *group.key)) if group.cell is None else group.cell
         cell = Cell(replace(group.condition, steps=end, overrides=overrides), tuple(sorted(runs)), id)
-        standing.append((cell, Progress("done" if min(steps) == end else "running", min(steps))))
+        standing.append((cell, Progress("done" if min(steps) == end else "begun", min(steps))))
         placed.append((id, group))
     return standing, placed
 

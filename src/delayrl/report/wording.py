@@ -222,9 +222,9 @@ def paper(summary: Summary) -> str:
 
 
 def states(summary: Summary) -> str:
-    """Write how many results are done, running, failed and to do."""
+    """Write how many results are in each state."""
     number_of = Counter(result.progress.state for result in summary.results.values())
-    parts = [f"{number_of[state]} {state}" for state in ("done", "running", "failed", "todo") if number_of[state]]
+    parts = [f"{number_of[state]} {state}" for state in ("done", "running", "begun", "failed", "todo") if number_of[state]]
     return f"{count(len(summary.results), 'result')}: {', '.join(parts)}"
 
 

@@ -8,7 +8,8 @@ from typing import Any, Literal, NamedTuple, Self
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
 
-CellState = Literal["todo", "running", "done", "failed"]
+CellState = Literal["todo", "begun", "running", "done", "failed"]
+"""`begun`: something is stored, and nobody works on it."""
 
 
 @dataclass(frozen=True)
