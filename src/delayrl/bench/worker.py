@@ -57,8 +57,9 @@ def work(folder: Path, device: str | None = None) -> Outcome:
         return Outcome("failed", str(error))
     except Exception as error:
         _log(traceback.format_exc())
-        # another try may find more memory or a disk that answers (JAX's errors are RuntimeErrors), but the same mistake
-        return Outcome("died" if isinstance(error, OSError | MemoryError | RuntimeError) else "failed", described(error))
+        # another try may find more memory or a disk that answers; JAX's errors are RuntimeErrors. A mistake stays
+        passes = isinstance(error, OSError | MemoryError | RuntimeError)
+        return Outcome("died" if passes else "failed", described(error))
 
 
 def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:

@@ -10,6 +10,7 @@ from delayrl.report.results import Anchor, Result, Setting, agent_order
 from delayrl.report.statistics import FEWEST, SMOOTHED, mean_std
 from delayrl.report.summary import Summary
 from delayrl.report.tables import Table, TableEntry
+from delayrl.run.cell import CellState
 from delayrl.run.cost import Cost
 
 PAPER = (
@@ -224,7 +225,8 @@ def paper(summary: Summary) -> str:
 def states(summary: Summary) -> str:
     """Write how many results are in each state."""
     number_of = Counter(result.progress.state for result in summary.results.values())
-    parts = [f"{number_of[state]} {state}" for state in ("done", "running", "begun", "failed", "todo") if number_of[state]]
+    order: tuple[CellState, ...] = ("done", "running", "begun", "failed", "todo")
+    parts = [f"{number_of[state]} {state}" for state in order if number_of[state]]
     return f"{count(len(summary.results), 'result')}: {', '.join(parts)}"
 
 
