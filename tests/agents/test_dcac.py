@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from conftest import record
-from delayrl.agents.base import reference_of, template
+from delayrl.agents.base import reference_of
 from delayrl.agents.dcac import DCAC, Roll, values
 from delayrl.agents.registry import AGENTS
 from delayrl.core import networks
@@ -319,4 +319,4 @@ def test_a_stretch_counts_what_arrived_in_it(delay: str) -> None:
 def test_the_preset_matched_is_traced_as_a_run_begins() -> None:
     """With the checks of types and shapes, which are the tests' own; its temperature is learned."""
     agent, spec = AGENTS["dcac"].presets["matched"].agent, Spec(10, 2, 3)
-    check_agent(agent, spec, template(agent, spec))
+    check_agent(agent, spec)

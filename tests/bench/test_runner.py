@@ -297,8 +297,9 @@ def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> Non
         return subprocess.Popen([sys.executable, "-c", sleep], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     monkeypatch.setattr("delayrl.bench.backends.local.start_worker", start)
+    monkeypatch.setattr("delayrl.bench.runner.GRACE", 1)
     began, backend = time.monotonic(), LocalBackend(tmp_path, 1)
-    completion = run_cells(cells("sac", "bpql"), tmp_path, backend, time_limit=1, grace=1)
+    completion = run_cells(cells("sac", "bpql"), tmp_path, backend, time_limit=1)
     assert time.monotonic() - began < 20
     assert {cell.condition.agent for cell in completion.unfinished} == {"sac", "bpql"}
 
@@ -325,7 +326,7 @@ def test_lock(tmp_path: Path) -> None:
     ) as other:
         assert other.stdout.readline() == "1\n"
         assert folders.holder(tmp_path).endswith(f" {other.pid}")
-        with pytest.raises(folders.LockedError), folders.hold_cell(tmp_path, patience=0.1):
+        with pytest.raises(folders.LockedError), folders.hold_cell(tmp_path):
             pass
         other.kill()
         other.communicate()

@@ -11,6 +11,7 @@ import delayrl
 from delayrl.cli.compare import differences
 from delayrl.cli.main import main
 from delayrl.play.evaluation import RANDOM_ACTIONS, TRAINING, reset_seed
+from delayrl.play.policy import Policy
 from delayrl.play.run import Run
 from short_runs import arrays, killed_and_resumed, newest, train
 
@@ -141,23 +142,26 @@ def test_evaluate_takes_a_run_its_folder_or_a_policy(vdpo: Run) -> None:
     result = delayrl.evaluate(vdpo, episodes=2)
     assert delayrl.evaluate(str(vdpo.path), episodes=2) == result
     policy = delayrl.load(vdpo)
-    assert delayrl.evaluate(policy, episodes=2, env="Reacher-v5")["returns"] == result["returns"]
+    assert str(policy.task) == result["env"] == "Reacher-v5"
+    assert delayrl.evaluate(policy, episodes=2)["returns"] == result["returns"]
     assert delayrl.evaluate(policy, episodes=2, env="Reacher-v5", delay=1)["delay"] == 1
-    with pytest.raises(delayrl.DelayRLError, match="a policy does not say what its task is: give env"):
-        delayrl.evaluate(policy)
+    nowhere = Policy(policy.agent, policy.state, policy.spec, policy.low, policy.high)
+    assert delayrl.evaluate(nowhere, episodes=2, env="Reacher-v5", delay=3)["returns"] == result["returns"]
+    with pytest.raises(delayrl.DelayRLError, match="this policy does not say what its task is: give env"):
+        delayrl.evaluate(nowhere)
     with pytest.raises(delayrl.DelayRLError, match="leave agent out"):
-        delayrl.evaluate(policy, env="Reacher-v5", agent="vdpo")
+        delayrl.evaluate(policy, agent="vdpo")
 
 
 def test_a_policy_knows_its_delay(tmp_path: Path) -> None:
     """Without one given, it is evaluated under that of its training, and it warns of ages that it never learned."""
     run = train("random", tmp_path / "run", delay="uniform:1:3", steps=100, random_steps=100)
     policy = delayrl.load(run)
-    result = delayrl.evaluate(policy, episodes=2, env=run.config["env"])
+    result = delayrl.evaluate(policy, episodes=2)
     assert result["delay"] == "uniform:1:3"
     assert result["returns"] == delayrl.evaluate(run, episodes=2)["returns"]
     with pytest.warns(delayrl.DelayWarning, match="learned no age below 1 steps, and delay 0 shows younger ones"):
-        delayrl.evaluate(policy, episodes=1, env=run.config["env"], delay=0)
+        delayrl.evaluate(policy, episodes=1, delay=0)
 
 
 def test_runs_on_the_command_line(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,9 +50,9 @@ holds("run.policy().act(obs, info)", action.shape == (1,), action)
 holds("delayrl.load(run) is the same", delayrl.load(run).act(obs, info) == action)
 result = delayrl.evaluate(run, 2)
 holds("delayrl.evaluate(run, 2)", len(result["returns"]) == 2, result)
-same = delayrl.evaluate(policy, 2, env="delayrl/Walk-v0")["returns"]
-holds("delayrl.evaluate(policy, 2, env=…)", same == result["returns"] == delayrl.evaluate("first", 2)["returns"], same)
-raises("delayrl.evaluate(policy)", lambda: delayrl.evaluate(policy), "give env, or a run")
+same = delayrl.evaluate(policy, 2)["returns"]
+holds("delayrl.evaluate(policy, 2)", same == result["returns"] == delayrl.evaluate("first", 2)["returns"], same)
+raises("delayrl.evaluate(policy, agent=…)", lambda: delayrl.evaluate(policy, agent="bpql"), "leave agent out")
 holds("delayrl.runs('.')", [one.path.name for one in delayrl.runs(".")] == ["first", "other", "slim", "whole"])
 small = {"preset": "small", "random_steps": 100, "evaluate_every": 100, "evaluation_episodes": 2, "progress": False}
 TINY = {**small, "hidden": [8, 8], "batch_size": 8}

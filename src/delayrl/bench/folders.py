@@ -35,16 +35,16 @@ class LockedError(Exception):
 
 
 @contextlib.contextmanager
-def hold_cell(folder: Path, patience: float = 1.0) -> Iterator[None]:
+def hold_cell(folder: Path) -> Iterator[None]:
     """Lock a cell until the block or the process ends, however it ends.
 
     Raises:
-        LockedError: another process still holds it after `patience` seconds; `holder` takes it for a moment.
+        LockedError: another process still holds it after a second; `holder` takes it for a moment.
     """
     import fcntl  # POSIX only
 
     with open(folder / "lock", "a+") as file:
-        give_up = time.monotonic() + patience
+        give_up = time.monotonic() + 1
         while True:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -61,7 +61,6 @@ def run_cells(
     *,
     tries: int = 5,
     time_limit: float | None = None,
-    grace: float = GRACE,
     stop: Event | None = None,
     say: Callable[[str], None] = lambda line: None,
     tick: Callable[[], None] = lambda: None,
@@ -74,7 +73,6 @@ def run_cells(
         backend: where they run.
         tries: how often in a row a cell may die without storing anything new.
         time_limit: seconds until all cells are asked to stop at a checkpoint.
-        grace: seconds that they then have before they are killed. A killed cell loses its steps since its checkpoint.
         stop: set this event to stop before the time is up.
         say: takes messages for people.
         tick: is called a few times a second.
@@ -90,7 +88,7 @@ def run_cells(
             if stopped is None and (time_is_up or (stop is not None and stop.is_set())):
                 stopped = now
                 queue.stop()
-            if stopped is not None and now - stopped > grace:
+            if stopped is not None and now - stopped > GRACE:
                 break
             queue.start(now)
             for cell, outcome in backend.ended():

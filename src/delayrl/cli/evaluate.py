@@ -47,13 +47,13 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
 
     from delayrl.play.evaluation import sweep
     from delayrl.play.plots import against_delay
-    from delayrl.play.policy import trained_delay
+    from delayrl.play.policy import load
 
     if given.delay is not None:
         raise DelayRLError("--sweep plays every delay; leave --delay out")
-    delays = trained_delay(given.run).maximum + 1
-    played = sweep(given.run, given.episodes, given.seed, **stored)
-    results = list(tqdm(played, total=delays, unit="delay", disable=given.json))
+    policy = load(given.run, **stored)
+    played = sweep(policy, given.episodes, given.seed)
+    results = list(tqdm(played, total=policy.spec.delay + 1, unit="delay", disable=given.json))
     if given.json:
         print(json.dumps(results))
     else:

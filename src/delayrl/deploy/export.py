@@ -10,8 +10,8 @@ from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import check_same, pack, space_json
 from delayrl.envs.making import make, seconds_of
-from delayrl.envs.task import Task, TaskLike, closing
-from delayrl.play.policy import Policy, restored, task_of, trained_delay
+from delayrl.envs.task import Task, TaskLike, closing, stored_task
+from delayrl.play.policy import Policy, restored
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import RunFolder, RunLike, path_of
@@ -43,7 +43,7 @@ def export_run(
     check_target(Path(out), force=force)
     source = RunFolder(path_of(run))
     config, checkpoint = source.config, source.latest()  # read once, because training may continue
-    task = task_of(run, env)
+    task = stored_task(config["env"], source.path, env)
     policy = restored(source, config, checkpoint, task, agent)
     metadata = describe(source, config, checkpoint.step, policy, task)
     network, arrays = network_of(policy)
@@ -93,7 +93,7 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
 
 def describe(run: RunFolder, config: dict[str, Any], step: int, policy: Policy, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
-    with closing(make(task, trained_delay(run.path))) as env:
+    with closing(make(task, policy.delay)) as env:
         seconds = seconds_of(env)
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import itertools
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -21,9 +20,9 @@ from delayrl.envs.making import check_limit, delay_of, make, name_of
 from delayrl.envs.task import Task, TaskLike, as_task, closing
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
-from delayrl.play.policy import Policy, load, spec_of, task_of
+from delayrl.play.policy import Policy, load, spec_of
 from delayrl.run.agents import AgentLike
-from delayrl.run.folder import RunFolder, RunLike, path_of
+from delayrl.run.folder import RunLike
 from delayrl.run.rows import deviation
 
 
@@ -52,15 +51,12 @@ class Evaluator:
         apply: Callable[..., Iterator[Any]] = map,
     ) -> None:
         served = servable(env, delay, spec)
-        self._delay, self._apply = spec.delay, apply
+        self._delay, self._apply, self._shape = spec.delay, apply, (seeds, episodes)
         self._act = _compiled_act(agent)
         with contextlib.ExitStack() as held:
-            self._envs = [
-                [held.enter_context(closing(make(env, served, rescale=True))) for _ in range(episodes)]
-                for _ in range(seeds)
-            ]
-            check_fits(self._envs[0][0], spec)
-            check_limit(self._envs[0][0], str(as_task(env)))
+            self._envs = [held.enter_context(closing(make(env, served, rescale=True))) for _ in range(seeds * episodes)]
+            check_fits(self._envs[0], spec)
+            check_limit(self._envs[0], str(as_task(env)))
             self._held = held.pop_all()  # now that nothing is refused any more
 
     def __call__(
@@ -76,42 +72,35 @@ class Evaluator:
         `opening` are first actions that are not the policy's, [seeds, episodes, steps, A]; `travel_seeds` the seeds of
         the travel times, if they are not those of the start states. Raises DelayRLError for what is not finite.
         """
-        shape = (len(self._envs), len(self._envs[0]))
-        returns, lengths, running = np.zeros(shape), np.zeros(shape, np.int64), np.ones(shape, bool)
-        seen = [
-            [self._see(*stepping.reset(env, int(seed))) for env, seed in zip(envs, seeds, strict=True)]
-            for envs, seeds in zip(self._envs, reset_seeds, strict=True)
-        ]
+        shape, number = self._shape, len(self._envs)
+        returns, lengths, running = np.zeros(number), np.zeros(number, np.int64), np.ones(number, bool)
+        starts = [stepping.reset(env, int(seed)) for env, seed in zip(self._envs, np.ravel(reset_seeds), strict=True)]
         if travel_seeds is not None:
-            seen = [
-                [self._see(*env.draw_from(seed)) for env, seed in zip(envs, seeds, strict=True)]
-                for envs, seeds in zip(self._envs, travel_seeds, strict=True)
-            ]
+            starts = [env.draw_from(int(seed)) for env, seed in zip(self._envs, np.ravel(travel_seeds), strict=True)]
+        seen = [self._see(*start) for start in starts]
         step = 0
         while running.any():
-            batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *itertools.chain(*seen))
-            actions = np.asarray(self._act(states, batch, keys, np.int32(step)))
+            batch = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *np.shape(x[0])), *seen)
+            actions = np.asarray(self._act(states, batch, keys, np.int32(step))).reshape(number, -1)
             if not (np.abs(actions[running]) <= 1).all():
                 raise DelayRLError("the policy gives actions beyond [-1, 1], or none that are numbers, in evaluation")
-            actions = opening[:, :, step] if opening is not None and step < opening.shape[2] else actions
+            if opening is not None and step < opening.shape[2]:
+                actions = opening[:, :, step].reshape(number, -1)
             step += 1
-            alive = [(int(i), int(j)) for i, j in np.argwhere(running)]
-            played = self._apply(self._step, alive, [actions[at] for at in alive])
-            for (i, j), (obs, reward, terminated, truncated, info) in zip(alive, played, strict=True):
+            alive = np.flatnonzero(running)
+            played = self._apply(stepping.step, [self._envs[i] for i in alive], actions[alive])
+            for i, (obs, reward, terminated, truncated, info) in zip(alive, played, strict=True):
                 if not (np.isfinite(reward) and np.isfinite(info["truth"]).all()):
                     raise DelayRLError("the environment gave a number that is not finite in evaluation")
-                returns[i, j] += reward
-                lengths[i, j] += 1
-                running[i, j] = not (terminated or truncated)
-                seen[i][j] = self._see(obs, info)
-        return Episodes(returns, lengths)
+                returns[i] += reward
+                lengths[i] += 1
+                running[i] = not (terminated or truncated)
+                seen[i] = self._see(obs, info)
+        return Episodes(returns.reshape(shape), lengths.reshape(shape))
 
     def close(self) -> None:
         """Close the environments."""
         self._held.close()
-
-    def _step(self, at: tuple[int, int], action: NDArray[np.float32]) -> Any:
-        return stepping.step(self._envs[at[0]][at[1]], action)
 
     def _see(self, obs: NDArray[Any], info: dict[str, Any]) -> Any:
         return seen_now(obs, info, self._delay, privileged=False)
@@ -178,7 +167,7 @@ def evaluate(
     """Play the policy of a run on start states that it never saw.
 
     Args:
-        run: the run, its folder, or a policy, whose task `env` then has to say.
+        run: the run, its folder, or a policy.
         episodes: how many.
         delay: any delay that it can serve, as `train`; None for the one it was trained for.
         seed: of the start states.
@@ -193,24 +182,17 @@ def evaluate(
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
-    if isinstance(run, Policy):
-        if env is None:
-            raise DelayRLError("a policy does not say what its task is: give env, or a run")
-        if agent is not None:
-            raise DelayRLError("a policy is of its own agent: leave agent out, or give a run")
-        task, policy, name = as_task(env, env_kwargs), run, type(run.agent).__name__
-    else:
-        config, task = RunFolder(path_of(run)).config, task_of(run, env, env_kwargs)
-        policy, name = load(run, task, agent=agent), config["agent"]
-    usual: DelayLike = policy.spec.delay if policy.trained is None else policy.trained
+    policy, task = _loaded(run, env, env_kwargs, agent)
     if delay is not None and (played := delay_of(task, delay)).minimum < policy.min_age:
-        line = f"{name} learned no age below {policy.min_age} steps, and delay {played.label()} shows younger ones"
+        line = (
+            f"{policy.name} learned no age below {policy.min_age} steps, and delay {played.label()} shows younger ones"
+        )
         warnings.warn(f"{line}; a Controller holds these back", DelayWarning, stacklevel=2)
-    return _play(policy, name, task, usual if delay is None else delay, episodes, seed)
+    return _play(policy, task, policy.delay if delay is None else delay, episodes, seed)
 
 
 def sweep(
-    run: RunLike,
+    run: RunLike | Policy,
     episodes: int = 10,
     seed: int = 0,
     *,
@@ -218,17 +200,30 @@ def sweep(
     env_kwargs: Mapping[str, Any] | None = None,
     agent: AgentLike | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Evaluate a run at every constant delay from 0 to the longest age that its policy was trained for.
+    """Evaluate a run, or a policy, at every constant delay from 0 to the longest age that its policy was trained for.
 
     Yields what `evaluate` returns, and `learned`: whether the policy learned that age, after the start of an episode.
     """
-    name, task = RunFolder(path_of(run)).config["agent"], task_of(run, env, env_kwargs)
-    policy = load(run, task, agent=agent)
+    policy, task = _loaded(run, env, env_kwargs, agent)
     for delay in range(policy.spec.delay + 1):
-        yield _play(policy, name, task, delay, episodes, seed) | {"learned": delay >= policy.min_age}
+        yield _play(policy, task, delay, episodes, seed) | {"learned": delay >= policy.min_age}
 
 
-def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:
+def _loaded(
+    run: RunLike | Policy, env: TaskLike | None, env_kwargs: Mapping[str, Any] | None, agent: AgentLike | None
+) -> tuple[Policy, Task]:
+    """Return the policy of a run, or the one given, and the task to play it on."""
+    if not isinstance(run, Policy):
+        run, env, env_kwargs = load(run, env, env_kwargs=env_kwargs, agent=agent), None, None
+    elif agent is not None:
+        raise DelayRLError("a policy is of its own agent: leave agent out, or give a run")
+    task = run.task if env is None else env
+    if task is None:
+        raise DelayRLError("this policy does not say what its task is: give env, or a run")
+    return run, as_task(task, env_kwargs)
+
+
+def _play(policy: Policy, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:
     if not isinstance(episodes, int | np.integer) or episodes < 1:
         raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
     check_seed(seed)
@@ -241,7 +236,7 @@ def _play(policy: Policy, name: str, task: Task, delay: DelayLike, episodes: int
     ):
         returns = evaluator(states, [seeds], jax.random.key(seed)[None]).returns[0]
     return {
-        "agent": name,
+        "agent": policy.name,
         "env": str(task),
         "delay": parsed.label(),
         "step": policy.step,

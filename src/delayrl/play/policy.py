@@ -32,6 +32,8 @@ class Policy:
         low, high: the range of its actions, [A], in single precision, rounded inwards.
         step: how many environment steps it has learned from; None if unknown.
         trained: the delay that it was trained under; None if unknown.
+        task: what it was trained on, or the `env` that it was loaded with; None if unknown.
+        name: that of its agent.
     """
 
     def __init__(
@@ -44,8 +46,11 @@ class Policy:
         *,
         step: int | None = None,
         trained: Delay | None = None,
+        task: Task | None = None,
+        name: str = "",
     ) -> None:
-        self.agent, self.state, self.spec, self.step, self.trained = agent, state, spec, step, trained
+        self.agent, self.state, self.spec, self.name = agent, state, spec, name or type(agent).__name__
+        self.step, self.trained, self.task = step, trained, task
         self.low, self.high = inner_range(low, high)
         self._key = jax.random.key(0)
 
@@ -54,6 +59,11 @@ class Policy:
                 return agent.act(state, seen, key, explore=False)
 
         self._act = jax.jit(decide)
+
+    @property
+    def delay(self) -> Delay | int:
+        """The delay that it was trained under; if unknown, the longest age that it takes."""
+        return self.spec.delay if self.trained is None else self.trained
 
     @property
     def min_age(self) -> int:
@@ -115,19 +125,8 @@ def load(
     """
     keep_compiled()
     folder = RunFolder(path_of(run))
-    return restored(folder, folder.config, folder.latest(), task_of(run, env, env_kwargs), agent)
-
-
-def task_of(run: RunLike, env: TaskLike | None = None, env_kwargs: Mapping[str, Any] | None = None) -> Task:
-    """Return the task of a run, or the one given instead, as `load`."""
-    folder = RunFolder(path_of(run))
-    return stored_task(folder.config["env"], folder.path, env, env_kwargs)
-
-
-def trained_delay(run: RunLike) -> Delay:
-    """Return the delay that a run was trained under. A law without a name has its maximum, and cannot be drawn from."""
-    folder = RunFolder(path_of(run))
-    return stored_delay(folder.config["delay"], folder.path)
+    config = folder.config
+    return restored(folder, config, folder.latest(), stored_task(config["env"], folder.path, env, env_kwargs), agent)
 
 
 def restored(
@@ -147,7 +146,8 @@ def restored(
         if not instead:
             raise
         raise DelayRLError(f"the run does not fit the {' and the '.join(instead)} given: {error}") from error
-    return Policy(agent, state, spec, actions.low, actions.high, step=checkpoint.step, trained=trained)
+    known = {"step": checkpoint.step, "trained": trained, "task": task, "name": config["agent"]}
+    return Policy(agent, state, spec, actions.low, actions.high, **known)
 
 
 def spec_of(env: Any) -> Spec:

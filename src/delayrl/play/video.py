@@ -17,12 +17,12 @@ from tqdm import tqdm
 
 from delayrl.delays import Delay, DelayLike
 from delayrl.envs.making import check_limit, make, name_of
-from delayrl.envs.task import Task, TaskLike
+from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError, one_line
 from delayrl.play import stepping
 from delayrl.play.evaluation import HELD_OUT, check_fits, check_seed, reset_seed, servable
 from delayrl.play.picture import Picture, aim, beside, caption, close, render
-from delayrl.play.policy import Policy, load, task_of, trained_delay
+from delayrl.play.policy import Policy, load
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
 from delayrl.run.disk import draft
@@ -98,10 +98,10 @@ def watch(
     with ExitStack() as stack:
         titles, episodes = [], []
         for path, config in zip(paths, configs, strict=True):
-            task = task_of(path, env, env_kwargs)
+            task = stored_task(config["env"], path, env, env_kwargs)
             own = agent if config["agent"] == configs[0]["agent"] else None
             policy = load(path, task, agent=own)
-            served = servable(task, trained_delay(path) if delay is None else delay, policy.spec)
+            served = servable(task, policy.delay if delay is None else delay, policy.spec)
             played = _rendering(task, served)
             stack.callback(close, played)
             check_fits(played, policy.spec)

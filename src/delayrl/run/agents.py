@@ -120,7 +120,8 @@ def code_of(name: str, agent: Agent) -> str | None:
     source = name if ":" in name else entry_points(GROUP).get(name, "")
     own = agent.agent if isinstance(agent, NormalisedObservations) else agent
     names = {source.partition(":")[0], type(own).__module__} - {""}
-    files = [getattr(sys.modules.get(module), "__file__", None) for module in sorted(names) if not _is_ours(module)]
+    theirs = sorted(module for module in names if module.partition(".")[0] != "delayrl")
+    files = [getattr(sys.modules.get(module), "__file__", None) for module in theirs]
     contents = [Path(file).read_bytes() for file in files if file and Path(file).is_file()]
     return hashlib.sha256(b"".join(contents)).hexdigest()[:12] if contents else None
 
@@ -131,10 +132,6 @@ def warn_of_other_code(config: Mapping[str, Any], folder: Path, agent: Agent) ->
     if known and code_of(config["agent"], agent) not in (None, known[-1]):
         line = f"the code of {config['agent']} has changed since {folder} was trained"
         warnings.warn(line, DelayWarning, stacklevel=3)
-
-
-def _is_ours(module: str) -> bool:
-    return module.partition(".")[0] == "delayrl"
 
 
 def as_trained(agent: Agent, schedule: Schedule) -> Agent:

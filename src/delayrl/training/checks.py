@@ -60,8 +60,8 @@ def check_memory(setup: Setup, spec: Spec, seeds: int, device: str | None) -> No
         raise DelayRLError(f"{line} replay_capacity{'' if seeds == 1 else ', or fewer seeds at a time'}")
 
 
-def check_fit(setup: Setup, env: Delayed) -> State:
-    """Return the shapes and types of the agent's state. Raises DelayRLError if it does not fit schedule and task."""
+def check_fit(setup: Setup, env: Delayed) -> None:
+    """Raise DelayRLError if an agent does not fit its schedule or its task."""
     agent, schedule, spec = setup.agent, setup.schedule, spec_of(env)
     if agent.ahead(spec) < 1:  # the window of a step needs the row after it, or its action and reward are zeros
         raise DelayRLError(f"an agent's ahead counts the steps of its targets, at least 1; got {agent.ahead(spec)}")
@@ -87,14 +87,12 @@ def check_fit(setup: Setup, env: Delayed) -> State:
     if every % block:  # or evaluating would change what is learned
         raise DelayRLError(f"evaluate_every must be a multiple of updates_per_call; got {every} and {block}")
     check_limit(env, str(setup.task))
-    return template(agent, spec)
+    template(agent, spec)  # its networks refuse sizes that they cannot have
 
 
-def check_agent(agent: Agent, spec: Spec, state: State) -> None:
-    """Raise DelayRLError if a run could not store, restore or log what the agent's functions return. Traces them.
-
-    `state` is the agent's `template`.
-    """
+def check_agent(agent: Agent, spec: Spec) -> None:
+    """Raise DelayRLError if a run could not store, restore or log what the agent's functions return. Traces them."""
+    state = template(agent, spec)
     _check_act(agent, spec, state)
     _check_updates(agent, spec, state)
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 from delayrl.agents.registry import AGENTS
-from delayrl.delays import Delay
+from delayrl.delays import Delay, stored_delay
 from delayrl.envs.task import Task, TaskLike, as_task, stored_task
 from delayrl.errors import DelayRLError
-from delayrl.play.policy import trained_delay
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike, find_agent
 from delayrl.run.condition import Setup, overrides_of, resolve
@@ -72,7 +71,8 @@ def go_on(
     if (task.env.name, task.env.kwargs, task.wrappers) != (name, named.env.kwargs, named.wrappers):
         hint = f"--from {runs[0].path} starts a new run with its networks"
         raise DelayRLError(f"a run goes on in its own task, {named}; got {task}: {hint}")
-    setup = setup_of(configs[0], agent, task, trained_delay(runs[0].path), steps)
+    delay = stored_delay(configs[0]["delay"], runs[0].path)
+    setup = setup_of(configs[0], agent, task, delay, steps)
     for one, config in zip(runs, configs, strict=True):
         _check(one, config, configs[0], steps)
     numbers = [config["seed"] for config in configs]

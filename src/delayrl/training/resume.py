@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import NDArray
 
-from delayrl.agents.base import Schedule
+from delayrl.agents.base import Schedule, template
 from delayrl.core import replay as ring
 from delayrl.core.types import Transition
 from delayrl.errors import DelayRLError
@@ -163,7 +163,8 @@ def _check_same(run: RunFolder, wanted: dict[str, Any]) -> None:
 
 def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) -> TrainState:
     """Return the state in the seeds' checkpoints. Raises DelayRLError if one does not fit, or an episode differs."""
-    states = [restore_tree(group.template, c.arrays("agent"), c.path) for c in checkpoints]
+    form = template(group.setup.agent, group.spec)
+    states = [restore_tree(form, c.arrays("agent"), c.path) for c in checkpoints]
     agent = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *states)
     step, rows = checkpoints[0].step, group.setup.replay_rows(group.spec)
     shapes = jax.eval_shape(lambda: ring.init(group.spec, rows))

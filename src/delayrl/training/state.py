@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.agents.base import State
 from delayrl.core.types import Key, Spec
 from delayrl.play.run import Run
 from delayrl.run.checkpoint import Checkpoint
@@ -41,7 +40,6 @@ class Group:
     folders: list[RunFolder]  # one folder for each seed
     keys: Key  # one random key for each seed
     spec: Spec
-    template: State  # shapes and types of the agent's state
     program: Program
     ways: Ways
     apply: Callable[..., Iterator[Any]] = map  # or that of a pool of threads, which step environments beside each other

@@ -128,8 +128,8 @@ def train_group(
         made = (make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers)
         envs = [held.enter_context(closing(env)) for env in made]
         spec = spec_of(envs[0])
-        shapes = check_fit(setup, envs[0])  # before anything is stored
-        check_agent(setup.agent, spec, shapes)
+        check_fit(setup, envs[0])  # before anything is stored
+        check_agent(setup.agent, spec)
         check_memory(setup, spec, len(numbers), ways.device)
         keep_compiled()
         if ways.device != "gpu":
@@ -145,7 +145,7 @@ def train_group(
         keys = jax.vmap(jax.random.key)(jnp.asarray(numbers))
         program = compiled(setup.agent, spec, setup.learnable(spec))
         apply = pool.map if ways.threads > 1 else map
-        group = Group(setup, numbers, folders, keys, spec, shapes, program, ways, apply, source, further)
+        group = Group(setup, numbers, folders, keys, spec, program, ways, apply, source, further)
 
         def note(line: str) -> None:
             if ways.progress:
