@@ -17,6 +17,7 @@ from delayrl.agents.lifting import Lifting, lifting_loss, moments
 from delayrl.agents.sac import BPQL
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian
+from delayrl.core.precision import BFLOAT16
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import look
 from delayrl.errors import DelayRLError
@@ -82,6 +83,14 @@ def test_nodes_are_no_more_than_needed() -> None:
     share = stats.norm.pdf(noise) / stats.norm.pdf(noise).sum()
     action = np.tanh([m + np.exp(s) * noise for m, s in GRID])
     assert np.abs(action @ share - truths()[:, 0]).max() > 3e-3
+
+
+def test_moments_are_not_rounded() -> None:
+    """A GPU would round their factors with `--precision bfloat16`."""
+    policy = Gaussian(jnp.zeros((4, 2)), jnp.zeros((4, 2)))
+    with jax.default_matmul_precision(BFLOAT16[0]):
+        assert "dot_general" in (program := str(jax.make_jaxpr(moments)(policy)))
+        assert "BF16" not in program
 
 
 def test_moments_are_those_of_samples() -> None:

@@ -136,6 +136,6 @@ def moments(policy: Gaussian) -> tuple[Float[Array, "*batch action"], Float[Arra
     noise = jnp.linspace(-SPAN, SPAN, NODES)
     share = jax.nn.softmax(-0.5 * noise**2)
     action = jnp.tanh(policy.mean[..., None] + jnp.exp(policy.log_std)[..., None] * noise)
-    mean = action @ share
-    variance = (action - mean[..., None]) ** 2 @ share
+    mean = jnp.matmul(action, share, precision="highest")
+    variance = jnp.matmul((action - mean[..., None]) ** 2, share, precision="highest")
     return mean, jnp.sqrt(variance + 1e-12)  # the root has infinite slope at 0, as for deterministic policies

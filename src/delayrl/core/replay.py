@@ -23,9 +23,9 @@ class Replay(NamedTuple):
     age: Int[Array, " capacity"]
     terminated: Bool[Array, " capacity"]
     moment: Int[Array, " capacity"]  # steps since the start of the row's episode
-    row_of: Int[Array, " capacity"]  # step j of the run (mod capacity) -> its row
+    row_of: Int[Array, " capacity"]  # j-th step that can be sampled (mod capacity) -> its row
     rows: Int[Array, ""]  # rows completed so far, so the row of the current observation
-    steps: Int[Array, ""]  # steps stored so far
+    steps: Int[Array, ""]  # how many these are so far, overwritten ones included
     lost: Int[Array, ""]  # how many of them the ring has overwritten
 
 
@@ -63,7 +63,7 @@ def current_moment(replay: Replay) -> Int[Array, ""]:
 
 
 def drawable(replay: Replay, hidden: Int[Array, ""] | int, learnable: Learnable = ALL) -> Int[Array, ""]:
-    """Return how many steps have arrived that can be sampled: all but those among the `hidden` newest steps."""
+    """Return the number of the first step that cannot be sampled yet, because it is among the `hidden` newest."""
     return replay.steps - jnp.clip(current_moment(replay) - learnable.first - learnable.until_end + 1, 0, hidden)
 
 

@@ -142,7 +142,8 @@ class Loop:
 
     def _can_learn(self) -> bool:
         """Whether every seed has steps to learn from, even while its newest are hidden."""
-        hidden, learnable = self.group.setup.delay.latest, self.group.program.learnable
+        setup, learnable = self.group.setup, self.group.program.learnable
+        hidden = 0 if setup.agent.privileged else setup.delay.latest
         counts = jax.vmap(lambda replay: ring.drawable(replay, hidden, learnable))(self.state.learner.replay)
         return int(counts.min()) > 0
 
