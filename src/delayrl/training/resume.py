@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,59 +32,87 @@ COLUMNS = ("obs", "action", "reward", "age", "terminated", "moment")
 COUNTS = ("rows", "steps", "lost")
 
 
+class Plan(NamedTuple):
+    """What to do with the run folders of a group, once nothing can be refused any more."""
+
+    replaced: list[RunFolder]  # to delete
+    new: list[RunFolder]  # to create; those to delete too
+    longer: list[RunFolder]  # of fewer steps, which go on
+
+
 def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[str], None]) -> TrainState:
     """Create the run folders, or resume from what they hold. `note` takes lines for people.
 
     Raises:
         DelayRLError: another run or other files in a folder, no common checkpoint, a damaged one.
     """
-    runs, config = group.folders, group.setup.config
-    replaced = [run for run in runs if overwrite and run.exists and run.config]
-    for run, seed in zip(runs, group.seeds, strict=True):
-        if run.exists and run.config and run not in replaced and not group.further:
-            try:
-                _check_same(run, config | {"seed": seed})
-            except DelayRLError:
-                if not all(_is_bare(other) for other in runs if other.exists):
-                    raise
-                replaced.append(run)  # another call failed before it stored anything
-        elif not run.exists and not run.is_free:
-            raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
-    checkpoints = [] if replaced else _common_checkpoints(group, note)
+    plan = _planned(group, overwrite)
+    checkpoints = [] if plan.replaced else _common_checkpoints(group, note)
     state = restore(group, actors, checkpoints) if checkpoints else _fresh(group, actors, note)
-    config |= {"configuration": group.setup.configuration}
+    config = group.setup.config | {"configuration": group.setup.configuration}
+    if plan.new or plan.longer:
+        config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
     used = versions()
     if code := code_of(config["agent"], group.setup.agent):
         used["agent_code"] = code
-    new = [run for run in runs if run in replaced or not run.exists]
-    longer = [run for run in runs if run not in new and run.config["schedule"]["steps"] != group.setup.schedule.steps]
-    if new or longer:
-        config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
-    if replaced:  # evaluations may need more environments than can be made
+    if plan.replaced:  # evaluations may need more environments than can be made
         for evaluator in evaluators(group, state.learner.agent).values():
             evaluator.close()
-    for run in replaced:  # now that nothing can be refused any more
+    for run in plan.replaced:
         run.remove()
-    for run, seed in zip(runs, group.seeds, strict=True):
-        if run in new:
+    for run, seed in zip(group.folders, group.seeds, strict=True):
+        if run in plan.new:
             run.create(config | {"versions": used, "seed": seed})
-    if not checkpoints:
-        for run in runs:
+    if checkpoints:
+        _go_on(group, plan, checkpoints, config, used, note)
+    else:
+        for run in group.folders:
             run.rewind(-1)
-        return state
-    newest = checkpoints[0]
+    return state
+
+
+def _planned(group: Group, overwrite: bool) -> Plan:
+    """Decide what to do with the run folders; changes nothing. Raises DelayRLError for what is in the way."""
+    there = {run.path: run.config for run in group.folders if run.exists}  # refuses those that cannot be read
+    replaced = [run for run in group.folders if overwrite and run.path in there]
+    for run, seed in zip(group.folders, group.seeds, strict=True):
+        if run.path not in there and not run.is_free:
+            raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
+        if run.path not in there or run in replaced or group.further:
+            continue
+        try:
+            _check_same(run, group.setup.config | {"seed": seed})
+        except DelayRLError:
+            if not all(_is_bare(other) for other in group.folders if other.path in there):
+                raise
+            replaced.append(run)  # another call failed before it stored anything
+    new = [run for run in group.folders if run in replaced or run.path not in there]
+    steps = group.setup.schedule.steps
+    longer = [run for run in group.folders if run not in new and there[run.path]["schedule"]["steps"] != steps]
+    return Plan(replaced, new, longer)
+
+
+def _go_on(
+    group: Group,
+    plan: Plan,
+    checkpoints: list[Checkpoint],
+    config: dict[str, Any],
+    used: dict[str, Any],
+    note: Callable[[str], None],
+) -> None:
+    """Bring the run folders to their checkpoints, and write down how they go on, with which versions."""
+    runs, newest = group.folders, checkpoints[0]
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
     warn_of_other_code(runs[0].config, runs[0].path, group.setup.agent)
     for run, checkpoint in zip(runs, checkpoints, strict=True):
-        if run in longer:
+        if run in plan.longer:
             run.extend(run.config | config)
         run.rewind(newest.step)
         if complete:
             run.finish(slim=group.ways.slim or not checkpoint.can_go_on)
         elif [used] != (known := versions_in(run.config))[-1:]:
             run.create(run.config | {"later_versions": [*known[1:], used]})
-    return state
 
 
 def _fresh(group: Group, actors: list[Actor], note: Callable[[str], None]) -> TrainState:
