@@ -135,14 +135,20 @@ def parse_arguments(text: str) -> tuple[dict[str, Any], str]:
 
 
 def contents(thing: Any, skipped: Collection[str] = ()) -> Any:
-    """Return what a dataclass holds, but for some fields, as JSON can; None if it cannot, or if it is not plain."""
+    """Return what a dataclass holds, as JSON can, but for some fields and those that JSON cannot hold.
+
+    A function or class stands as the name that it can be imported by. None if there is nothing to return.
+    """
     if is_dataclass(thing) and not isinstance(thing, type):
         held = {field.name: getattr(thing, field.name) for field in fields(thing) if field.name not in skipped}
-        inner = {name: contents(value, skipped) for name, value in held.items() if value is not None}
-        return None if None in inner.values() else {"": type(thing).__qualname__, **inner}
+        inner = {name: contents(value, skipped) for name, value in held.items()}
+        return {"": type(thing).__qualname__, **{name: value for name, value in inner.items() if value is not None}}
     if isinstance(thing, tuple | list):
         items = [contents(value, skipped) for value in thing if value is not None]
         return None if None in items else items
     if isinstance(thing, Mapping):
         return contents(sorted((str(key), value) for key, value in thing.items() if value is not None))
-    return thing if isinstance(thing, str | int | float) else None
+    if isinstance(thing, str | int | float):
+        return thing
+    name = name_of_object(thing) if callable(thing) else "<>"
+    return None if name.startswith("<") else name

@@ -71,6 +71,34 @@ def test_runs_that_differ_in_an_option_are_two_results(tmp_path: Path) -> None:
     assert summary.shared == {("bpql", ""): {"steps": 300}}
 
 
+def renamed(rows: Path, agent: str, code: str) -> Path:
+    """The rows of a run of somebody's own agent, whose preset no report knows."""
+    for file in (rows, rows.parent / "config.json"):
+        file.write_text(file.read_text().replace('"bpql"', json.dumps(agent)))
+    folder = RunFolder(rows.parent)
+    folder.create(folder.config | {"versions": {"agent_code": code}})
+    return rows
+
+
+def test_runs_of_an_own_agent_are_named_by_the_options_that_differ(tmp_path: Path) -> None:
+    """And where its code is not the same in all of them, the report says so."""
+    one = renamed(made(tmp_path / "a", 1.0), "mine:Agent", "1a")
+    two = renamed(made(tmp_path / "b", 2.0, discount=0.9, batch_size=64), "mine:Agent", "1a")
+    usual = {name: RunFolder(one.parent).config["hyperparameters"][name] for name in ("batch_size", "discount")}
+    first = f"mine:Agent batch_size={usual['batch_size']} discount={usual['discount']}"
+    assert finals(one, two) == {first: [1.0], "mine:Agent batch_size=64 discount=0.9": [2.0]}
+    assert "The code of" not in markdown(summary_of(one, two), "", {})
+    assert finals(one) == {"mine:Agent": [1.0]}
+    later = renamed(made(tmp_path / "c", 3.0, seed=1), "mine:Agent", "2b")
+    assert "The code of mine:Agent is not the same in all runs" in markdown(summary_of(one, later), "", {})
+
+
+def test_one_run_in_two_folders_is_one_line(tmp_path: Path) -> None:
+    twice = made(tmp_path / "a", 1.0), made(tmp_path / "b", 1.0)
+    with pytest.raises(DelayRLError, match=r"a/rows.jsonl and .*b/rows.jsonl hold runs of the same options and seed"):
+        summary_of(*twice)
+
+
 def test_runs_that_began_otherwise_say_so_and_are_no_reference(tmp_path: Path) -> None:
     """A delay-free SAC that began with another's networks has trained for longer than its steps."""
     begun = {"from": {"agent": "sac", "step": 900}}

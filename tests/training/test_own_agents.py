@@ -1,7 +1,10 @@
 """Agents of a user are trained, resumed, evaluated, loaded and exported; in grids and from the command line too."""
 
+import inspect
 import json
+import linecache
 import sys
+import types
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,9 +26,10 @@ from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.play.run import Run
 from delayrl.play.video import watch
-from delayrl.run.agents import as_agent, find_agent, known_agents
+from delayrl.run.agents import TAKEN, as_agent, code_of, find_agent, known_agents
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.condition import overrides_of, resolve
+from delayrl.run.configuration import values_of
 from own_agents import Shrink
 from own_tasks import Arm, make_arm, write_module
 from short_runs import arrays, declare
@@ -256,6 +260,7 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
         ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
         ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
         ("own_agents:Steps", "has an option steps, as every run has"),
+        ("own_agents:Progress", "has an option progress, as every run has"),
         ("own_agents:Twice", "has two options factor with different values, and one name sets both"),
         ("own_agents:Wordy", "name must be a number; got 'me'"),
         ("not_there:Agent", "cannot import 'not_there': ModuleNotFoundError"),
@@ -307,14 +312,53 @@ def test_two_agents_without_a_name_are_two_runs(tmp_path: Path) -> None:
     assert longer.config["unnamed"] == run.config["unnamed"]
 
 
-@pytest.mark.parametrize("name", ["quiet", "progress"])
-def test_an_option_of_the_command_is_refused(name: str, capsys) -> None:
-    """Also a parameter of `train`. In Python an instance may have it, and its runs are read."""
+def test_an_option_of_the_command_is_refused(capsys) -> None:
+    """In Python an instance may have it, and its runs are read."""
     with pytest.raises(SystemExit):
-        main(["train", f"own_agents:{name.title()}", "--env", "Reacher-v5"])
-    line = f"delayrl: the agent has an option --{name}, as the command has: give it another name\n"
+        main(["train", "own_agents:Quiet", "--env", "Reacher-v5"])
+    line = "delayrl: the agent has an option --quiet, as the command has: give it another name\n"
     assert capsys.readouterr().err == line
-    assert find_agent(f"own_agents:{name.title()}").presets
+    assert find_agent("own_agents:Quiet").presets
+
+
+def test_no_option_is_named_as_a_parameter_of_train() -> None:
+    """`train(agent, env, delay=2)` would take it for its own, and so would a cell of a grid with that override."""
+    assert {*inspect.signature(delayrl.train).parameters} - {"values"} == TAKEN
+    ours = {name for known in AGENTS.values() for preset in known.presets.values() for name in values_of(preset.agent)}
+    assert not ours & TAKEN
+
+
+NOTEBOOK = """
+from dataclasses import dataclass
+import base_of_notebook, own_agents
+
+@dataclass(frozen=True)
+class Mine(base_of_notebook.Base):
+    def update(self, state, windows, key, count):
+        return state, {"factor": FACTOR}
+"""
+
+
+def test_code_of_bases_parts_and_notebooks_counts(tmp_path: Path, monkeypatch) -> None:
+    """A class of a notebook has no file, but its functions have a source; its bases are in modules."""
+    base = tmp_path / "base_of_notebook.py"
+    base.write_text("import own_agents\nclass Base(own_agents.Shrink):\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "notebook_cell", types.ModuleType("notebook_cell"))
+
+    def code(factor: str) -> str | None:
+        source = NOTEBOOK.replace("FACTOR", factor)
+        monkeypatch.setitem(linecache.cache, "<cell>", (len(source), None, source.splitlines(keepends=True), "<cell>"))
+        names = sys.modules["notebook_cell"].__dict__
+        exec(compile(source, "<cell>", "exec"), names)
+        return code_of("<Mine>", names["Mine"]())
+
+    first = code("1.0")
+    assert code("1.0") == first is not None
+    assert code("2.0") != first
+    base.write_text(base.read_text() + "    level: float = 0.5\n")
+    assert code("1.0") != first
+    assert code_of("bpql", AGENTS["bpql"].presets["small"].agent) is None
 
 
 def test_an_option_with_a_percent_sign(capsys) -> None:

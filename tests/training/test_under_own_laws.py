@@ -1,6 +1,7 @@
 """Laws of delays of a user are trained under, resumed, evaluated and exported."""
 
 import dataclasses
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,3 +101,17 @@ def test_two_laws_without_a_name_are_two_runs(tmp_path: Path) -> None:
     with pytest.raises(DelayRLError, match="holds a run with another env"):
         train("random", tmp_path / "spec", env=dataclasses.replace(spec, max_episode_steps=60))
     assert contents(lambda: 0) is contents([object()]) is contents({"a": object()}) is None
+
+    @dataclass(frozen=True)
+    class Held:
+        scale: float
+        activation: Any = math.tanh
+        shape: Any = contents
+        other: Any = lambda: 0
+
+    assert contents(Held(1.0)) == {
+        "": Held.__qualname__,
+        "scale": 1.0,
+        "activation": "math:tanh",
+        "shape": "delayrl.lookup:contents",
+    }

@@ -1,7 +1,6 @@
 """`delayrl train AGENT`: train an agent, or resume a run. `delayrl train RUN`: train a run further."""
 
 import argparse
-import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -77,9 +76,8 @@ def _add_ways(parser: Parser) -> None:
 
 def _add_group(parser: Parser, title: str, config: Any) -> None:
     from delayrl.run.configuration import options
-    from delayrl.training.train import train
 
-    group, taken = parser.add_argument_group(title), inspect.signature(train).parameters
+    group = parser.add_argument_group(title)
     for option in options(config):
         settings: dict[str, Any] = {"type": _reader(option.kind), "metavar": "VALUE"}
         default = option.default
@@ -91,8 +89,6 @@ def _add_group(parser: Parser, title: str, config: Any) -> None:
         name = f"--{option.name.replace('_', '-')}"
         words = f"{option.help} (default: {default})".replace("%", "%%")
         try:
-            if option.name in taken:
-                raise argparse.ArgumentError(None, "a parameter of delayrl.train")
             group.add_argument(name, default=argparse.SUPPRESS, help=words, **settings)
         except argparse.ArgumentError as error:
             raise DelayRLError(f"the agent has an option {name}, as the command has: give it another name") from error

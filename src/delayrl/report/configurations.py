@@ -10,6 +10,7 @@ from delayrl.errors import DelayRLError
 from delayrl.report.rows import Key, RowGroup, whole_lines
 from delayrl.run.condition import Condition, overrides_of
 from delayrl.run.folder import RunFolder, check_more
+from delayrl.run.rows import CONDITION, CONFIGURATION
 
 Config = Mapping[str, Any]
 """What a run's config.json holds."""
@@ -18,10 +19,18 @@ FROM = "from"
 
 
 def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
-    """Yield the configurations beside rows.jsonl files, and those in files that `benchmarks/collect.py` wrote."""
+    """Yield the configurations beside rows.jsonl files, and those in files that `benchmarks/collect.py` wrote.
+
+    Raises DelayRLError for a file that cannot be read, and two runs that their rows do not tell apart.
+    """
+    first: dict[str, Path] = {}
     for path in paths:
         if (path.parent / "config.json").is_file():
-            yield RunFolder(path.parent).config
+            config = RunFolder(path.parent).config
+            same = json.dumps([config.get(name) for name in (*CONDITION, CONFIGURATION, "seed")])
+            if (other := first.setdefault(same, path)) is not path:
+                raise DelayRLError(f"{other} and {path} hold runs of the same options and seed; give one of them")
+            yield config
             continue
         try:
             with open(path, "rb") as file:
@@ -58,15 +67,27 @@ def _beginning(config: Config) -> dict[str, str]:
 
 
 def distinct_overrides(groups: Sequence[RowGroup]) -> list[dict[str, Any]]:
-    """Return overrides that tell groups of different configurations apart: by what differs, or else by the hash."""
+    """Return overrides that tell groups of different configurations apart.
+
+    Where the preset is not known, as of an agent of one's own, these are the options that differ between the groups,
+    and where even these are not known, the hash of the configuration.
+    """
     overrides = [overrides_of(group.config) | _beginning(group.config) for group in groups]
-    alike: dict[str, set[str | None]] = defaultdict(set)
+    alike: dict[str, list[RowGroup]] = defaultdict(list)
     names = []
     for group, own in zip(groups, overrides, strict=True):
         c = group.condition
         names.append(json.dumps([c.agent, c.preset, c.protocol, own], sort_keys=True))
-        alike[names[-1]].add(group.configuration)
-    return [
-        own | {"configuration": group.configuration[:8]} if group.configuration and len(alike[name]) > 1 else own
-        for group, own, name in zip(groups, overrides, names, strict=True)
-    ]
+        alike[names[-1]].append(group)
+    return [own | _apart(group, alike[name]) for group, own, name in zip(groups, overrides, names, strict=True)]
+
+
+def _apart(group: RowGroup, alike: Sequence[RowGroup]) -> dict[str, Any]:
+    """Return what tells a group from others that have the same name, if their configurations differ."""
+    if not group.configuration or len({other.configuration for other in alike}) < 2:
+        return {}
+    configs = [group.config, *(other.config for other in alike if other.configuration != group.configuration)]
+    own, *others = ({**one.get("hyperparameters", {}), **one.get("schedule", {})} for one in configs)
+    differing = {name: value for name, value in own.items() if any(other.get(name) != value for other in others)}
+    told = own not in others and all(configs)
+    return differing if told else {**differing, "configuration": group.configuration[:8]}

@@ -49,6 +49,7 @@ class Summary:
     comparisons: list[Comparison]
     unplaced: int  # how many rows belong to no cell
     changed: list[str]  # tasks whose physics are not the same in all rows of one MuJoCo version
+    recoded: list[str]  # agents of whose code the runs had several versions
     versions: list[Mapping[str, Any]]  # libraries, commits and hardware that the runs were trained with
 
     @property
@@ -99,7 +100,8 @@ def summarise(
     results = make_results(standing, group_of, labels, inferred=inferred)
     every, changed = results.values(), _changed_tasks([group for _, group in placed])
     made = make_tables(every), _make_aggregates(every), make_comparisons(every)
-    return Summary(results, shared, *made, unplaced, changed, [used for c in configs for used in versions_in(c)])
+    used: list[Mapping[str, Any]] = [versions for config in configs for versions in versions_in(config)]
+    return Summary(results, shared, *made, unplaced, changed, _recoded(configs), used)
 
 
 def _changed_tasks(groups: Iterable[RowGroup]) -> list[str]:
@@ -108,6 +110,14 @@ def _changed_tasks(groups: Iterable[RowGroup]) -> list[str]:
     for group in groups:
         found[group.condition.env] |= group.physics
     return sorted(env for env, models in found.items() if len(models) > len({version for version, _ in models}))
+
+
+def _recoded(configs: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return agents of whose modules the runs had several versions: their results are of other agents."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for config in configs:
+        found[str(config.get("agent"))] |= {str(used.get("agent_code", "")) for used in versions_in(config)} - {""}
+    return sorted(agent for agent, codes in found.items() if len(codes) > 1)
 
 
 Placed = list[tuple[str, RowGroup]]

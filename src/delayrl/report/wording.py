@@ -243,7 +243,7 @@ def overrides(summary: Summary) -> list[str]:
 
 
 def remarks(summary: Summary) -> list[str]:
-    """Write what must be known of all results: rows left out, tasks that changed, overrides."""
+    """Write what must be known of all results: rows left out, tasks and agents that changed, overrides."""
     line = f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out."
     left_out = [line] if summary.unplaced else []
     changed = [
@@ -251,7 +251,11 @@ def remarks(summary: Summary) -> list[str]:
         "tasks stand together."
         for env in summary.changed
     ]
-    return left_out + changed + overrides(summary)
+    recoded = [
+        f"The code of {agent} is not the same in all runs: returns of different agents stand together."
+        for agent in summary.recoded
+    ]
+    return left_out + changed + recoded + overrides(summary)
 
 
 def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:

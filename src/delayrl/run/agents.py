@@ -5,6 +5,7 @@ a class, an instance, or a `Registration` that has presets. In Python the class 
 run keeps the name beside the hyperparameters; what no name leads back to, such as a class in a script, is `<object>`.
 """
 
+import contextlib
 import difflib
 import hashlib
 import inspect
@@ -26,6 +27,11 @@ from delayrl.run.folder import versions_in
 GROUP = "delayrl.agents"
 AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
+TAKEN = {
+    *("agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device"),
+    *("overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress"),
+}
+"""Names of the parameters of `delayrl.train`, which takes an option of an agent by its name too."""
 PARTS = ("privileged", "ahead", "phases", "init", "act", "deterministic")
 """What the protocol `Agent` asks for."""
 
@@ -71,7 +77,7 @@ def find_agent(name: str, stored: Path | None = None) -> Registration:
     if ":" not in name:
         declared = entry_points(GROUP)
         if name not in declared:
-            near = difflib.get_close_matches(name, agent_names(), n=2, cutoff=0.5)
+            near = difflib.get_close_matches(name.lower(), agent_names(), n=2, cutoff=0.5)
             usual = "`delayrl agents` lists them; one of your own is MODULE:NAME, and a run is named by its folder"
             hint = f"did you mean {', '.join(near)}?" if near else usual
             raise DelayRLError(f"unknown agent {name!r}; {hint}")
@@ -113,17 +119,35 @@ def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = 
 
 
 def code_of(name: str, agent: Agent) -> str | None:
-    """Return a checksum of the modules that name and class of an agent lead to; None for those of this package.
+    """Return a checksum of the modules that an agent's name, its classes and those of its parts are in.
 
-    What those modules import is not in it.
+    Of classes without a module's file, as in a notebook, it takes their functions. What those modules import is not in
+    it. None for agents of this package, and where no code can be read.
     """
     source = name if ":" in name else entry_points(GROUP).get(name, "")
-    own = agent.agent if isinstance(agent, NormalisedObservations) else agent
-    names = {source.partition(":")[0], type(own).__module__} - {""}
-    theirs = sorted(module for module in names if module.partition(".")[0] != "delayrl")
-    files = [getattr(sys.modules.get(module), "__file__", None) for module in theirs]
-    contents = [Path(file).read_bytes() for file in files if file and Path(file).is_file()]
-    return hashlib.sha256(b"".join(contents)).hexdigest()[:12] if contents else None
+    own: Any = agent.agent if isinstance(agent, NormalisedObservations) else agent
+    parts = [own, *filter(is_dataclass, (getattr(own, field.name) for field in fields(own)))]
+    classes = list(dict.fromkeys(kind for part in parts for kind in type(part).__mro__))
+    names = {source.partition(":")[0], *(kind.__module__ for kind in classes)} - {""}
+    code = []
+    for module in sorted(names):
+        file = getattr(sys.modules.get(module), "__file__", None)
+        if module.partition(".")[0] in {"delayrl", *sys.stdlib_module_names}:
+            continue
+        if file and Path(file).is_file():
+            code.append(Path(file).read_bytes())
+        else:
+            code += [_source(kind) for kind in classes if kind.__module__ == module]
+    return hashlib.sha256(b"".join(code)).hexdigest()[:12] if any(code) else None
+
+
+def _source(kind: type) -> bytes:
+    """Return the source of a class's functions, as far as it can be read."""
+    text = ""
+    for function in filter(inspect.isfunction, vars(kind).values()):
+        with contextlib.suppress(OSError):  # generated, or typed where nothing keeps it
+            text += inspect.getsource(function)
+    return text.encode()
 
 
 def warn_of_other_code(config: Mapping[str, Any], folder: Path, agent: Agent) -> None:
@@ -177,7 +201,7 @@ def _checked(thing: Any, name: str) -> Agent:
         if any(option.name == other.name and option.default != other.default for other in own):
             line = f"agent {name} has two options {option.name} with different values, and one name sets both"
             raise DelayRLError(f"{line}: give one another name, or leave out its Annotated")
-        if option.name in values_of(Schedule()):
+        if option.name in TAKEN or option.name in values_of(Schedule()):
             raise DelayRLError(f"agent {name} has an option {option.name}, as every run has: give it another name")
         option.check(option.default)
     return agent  # type: ignore[no-any-return]

@@ -59,6 +59,8 @@ def taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) ->
         filled |= {name: offered[name] for part in fitting(fresh, offered) for name in parts[part]}
     taken = [part for part, names in parts.items() if names[0] in filled]
     left = ", ".join(part for part in parts if part not in taken)
+    if not parts:
+        raise DelayRLError(f"there is no network to take over from {source.path.parents[1]}: this agent has none")
     if not set(taken) - {"moments"}:
         where, norms = source.path.parents[1], [_normalisation(arrays) for arrays in (stored, fresh)]
         line = f"{where} has no network that fits: it lacks {left}, or has them in other sizes"
