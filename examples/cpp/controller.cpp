@@ -17,6 +17,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <ctime>
+#include <filesystem>
 #include <fstream>
 #include <iostream>
 #include <map>
@@ -148,7 +149,7 @@ class Parser {
 
 std::string contents(const std::string& path, std::size_t limit) {
     std::ifstream file(path, std::ios::binary | std::ios::ate);
-    if (!file) refuse("cannot read " + path);
+    if (!file || !std::filesystem::is_regular_file(path)) refuse("cannot read " + path);
     std::streamoff size = file.tellg();
     if (size < 0 || static_cast<std::size_t>(size) > limit) refuse(path + " is too large");
     std::string data(static_cast<std::size_t>(size), 0);

@@ -16,8 +16,10 @@ import delayrl
 import own_tasks
 from delayrl.envs.making import delay_of, make
 from delayrl.envs.task import Part, Task, as_task, closing, stored_task
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
+from delayrl.play import stepping
 from delayrl.run.condition import resolve
+from delayrl.wrappers import layers
 from delayrl.wrappers.layers import limit_of, seconds_of
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
 
@@ -378,6 +380,31 @@ def test_rounding_brings_no_action_beyond_its_range() -> None:
         env.reset(seed=0)
         for action in np.linspace(-1, 1, 9, dtype=np.float32):
             env.step(np.full(1, action))
+
+
+@pytest.mark.parametrize(("dt", "words"), [("20ms", "'20ms'"), (0, "0"), (-0.02, "-0.02"), (lambda: 0.02, "a method")])
+def test_a_dt_that_is_no_time_is_told(dt: Any, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Timed(Arm):
+        pass
+
+    monkeypatch.setattr(layers, "_warned", set())
+    env = TimeLimit(Timed(), 20)
+    env.unwrapped.dt = dt  # type: ignore[attr-defined]
+    with pytest.warns(DelayWarning, match=f"Timed: its dt is {words}, not seconds above 0, and is not used"):
+        assert seconds_of(env) is None
+
+
+def test_errors_name_the_last_line_of_the_users_code() -> None:
+    """Not that of a library which it calls, or of a wrapper around it."""
+
+    class Broken(Arm):
+        def step(self, action: Any) -> Any:
+            return np.linalg.inv(np.zeros((2, 2)))
+
+    env = make(lambda: TimeLimit(Broken(), 20), 0)
+    stepping.reset(env, 0)
+    with pytest.raises(DelayRLError, match=r"Broken failed in step: LinAlgError: Singular matrix \(test_task.py, line"):
+        stepping.step(env, np.zeros(1, np.float32))
 
 
 def test_a_step_of_repeated_actions_is_longer_and_an_episode_of_them_shorter() -> None:

@@ -19,6 +19,7 @@ from gymnasium.wrappers import DelayObservation, StickyAction
 from delayrl import DelayRLError, DelayWarning
 from delayrl.cli.console import seconds
 from delayrl.cli.main import main
+from delayrl.cli.measure import _show_environment
 from delayrl.delays import as_delay
 from delayrl.envs.task import quiet
 from delayrl.measure import from_log, probe
@@ -249,6 +250,27 @@ def test_actions_in_the_observation_are_no_observation_of_them() -> None:
     assert p.components == (4, 4, 4, None, None, None, None, None)
 
 
+@pytest.mark.parametrize("how", ["error", "other units"])
+def test_what_is_made_from_the_action(how: str) -> None:
+    """An error, of which some pushes show the action alone, is left out; a command in other units is told."""
+
+    class More(gym.ObservationWrapper):
+        def step(self, action):
+            self.action = action
+            return super().step(action)
+
+        def reset(self, **words):
+            self.action = np.zeros(1)
+            return super().reset(**words)
+
+        def observation(self, observation):
+            return np.append(observation, self.action - observation[0] if how == "error" else self.action / 2)
+
+    p = probe(lambda: More(DelayObservation(make("Pendulum-v1"), 3)), episodes=2)
+    assert (sorted(p.total), p.echoes) == (([3], (3,)) if how == "error" else ([0], ()))
+    assert ("hide the delay of the others" in _show_environment(p)) == (how == "other units")
+
+
 def test_without_a_visible_state_rewards_tell() -> None:
     class Plain(gym.Wrapper):  # truth would be in Delayed's info
         def step(self, action):
@@ -345,6 +367,47 @@ def test_whole_names_come_before_prefixes(
     path = write(tmp_path / "log.csv", {name: np.arange(5.0) for name in names})
     log = read_signals(Table(path), commands=commands, observations=observations)
     assert (list(log.command_names), list(log.observation_names)) == wanted
+
+
+@pytest.mark.parametrize("policy", [True, False])
+def test_commands_that_come_back_are_no_answer(
+    policy: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A set-point, the last command or an error beside the plant's answer changes nothing, and is told."""
+    u, y = signals("servo", 3, policy=policy)
+    alone = from_log(log(tmp_path / "alone.csv", u, y))
+    assert alone.echoes == ()
+    last = np.append(0, u[:-1])
+    more = {"obs_goal": u, "obs_last": last, "obs_error": last - 0.2 * y, "obs_scaled": -3 * u}
+    for name, values in more.items():
+        path = write(tmp_path / "log.csv", {"time": ROW * np.arange(len(u)), "command": u, "obs": y, name: values})
+        e = from_log(path)
+        assert e.echoes == (name,)
+        assert (e.delay, e.low, e.high, e.peak) == (alone.delay, alone.low, alone.high, alone.peak)
+    main(["measure", str(path)])
+    assert "obs_scaled repeats a command: left out" in capsys.readouterr().out
+    alike = write(tmp_path / "only.csv", {"time": ROW * np.arange(len(u)), "command": u, "obs_last": last})
+    main(["measure", str(alike)])
+    assert "obs_last repeats a command: the answer may not be the plant's" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "doubtful"),
+    [
+        ({"period": 1.0}, False),
+        ({"period": 25.0}, True),
+        ({"period": 25.0, "unit": "s"}, True),
+        ({"period": 0.001}, True),
+        ({"period": 0.001, "unit": "s"}, False),
+        ({"unit": "us"}, False),
+    ],
+)
+def test_units_that_do_not_fit_each_other(words: dict, doubtful: bool, tmp_path: Path) -> None:
+    """Far more or fewer rows in a period than a loop has: one of the two units is wrong."""
+    u, y = signals("servo", 3, 600)
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        from_log(log(tmp_path / "log.csv", u, y), **words)
+    assert [str(w.message).endswith("check --unit, and that of --period") for w in caught] == [True] * doubtful
 
 
 def test_held_commands(tmp_path: Path) -> None:
@@ -772,7 +835,7 @@ def replaced(values: np.ndarray, row: int, by: object) -> list:
         ({"when": TIME, "command": COMMAND, "obs": OBS}, "no column time"),
         ({"time": TIME, "torque": COMMAND, "obs": OBS}, "--commands"),
         ({"time": TIME, "command": COMMAND, "angle": OBS}, "--observations"),
-        ({"stamp": TIME, "received": TIME - 0.1}, "the clocks differ"),
+        ({"stamp": TIME, "received": TIME - 0.1}, "--stamp and --received are swapped, or the clocks differ"),
         ({"stamp": TIME[::-1], "received": TIME[::-1] + 0.1}, "the stamp goes back"),
         ({"stamp": TIME[:5], "received": TIME[:5]}, "too short"),
     ],

@@ -13,9 +13,10 @@ from tqdm import tqdm
 from delayrl.cli.console import add_env_kwargs, add_wrappers, seconds, whole
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError
-from delayrl.measure.log import Estimated, from_log, plot
+from delayrl.measure.log import Estimated, from_log
+from delayrl.measure.plot import plot
 from delayrl.measure.probing import Counts, Probed, probe
-from delayrl.measure.reading import UNITS, in_doubt
+from delayrl.measure.reading import UNITS, doubt
 
 COLUMNS = ("time", "commands", "observations", "episode", "stamp", "received")
 
@@ -65,7 +66,7 @@ def run(given: argparse.Namespace) -> None:
             result.save(given.save)
         if given.plot:
             plot(result, given.plot)
-        doubtful = in_doubt(result.row, given.unit)
+        doubtful = bool(doubt(result.row, result.period, given.unit))
         print(json.dumps(result.json()) if given.json else _show_log(result, given.save, doubtful))
         return
     _refuse(given, ("period", *COLUMNS, "unit", "warm_up", "plot", "save"), "a log", "an environment")
@@ -103,6 +104,11 @@ def _show_environment(p: Probed) -> str:
     if len(components) > 1:
         each = "; ".join(f"{_ranges(numbers)} after {steps}" for steps, numbers in sorted(components.items()))
         lines.append(f"Components of the observation react at the earliest: {each}.")
+        if 0 in components:
+            lines.append(
+                f"Those that react at once ({_ranges(components[0])}) hide the delay of the others. If they are made"
+            )
+            lines.append("from the action, such as an error or a command in other units, measure without them.")
     if p.maximum:
         actions = _plural(p.maximum, "action")
         lines += ["", f"An agent must remember {actions}. `delayrl train` does not see this delay:"]
@@ -126,7 +132,10 @@ def _show_log(e: Estimated, saved: Path | None, doubtful: bool) -> str:
     lines = [f"{e.path}: {e.rows:,} rows, one each {_ms(e.row)}, without the first {e.warm_up:.3g} s", ""]
     lines += _show_stamps(e) if e.method == "stamps" else _show_correlation(e)
     if doubtful:
-        lines += ["", "which delay to train with depends on the unit of the time stamps: give --unit"]
+        lines += [
+            "",
+            "which delay to train with depends on the units: give --unit, that of the time stamps, and --period",
+        ]
     elif e.in_step == e.train_with:
         lines += ["", f"train with: --delay {e.train_with}"]
     else:
@@ -160,6 +169,10 @@ def _show_correlation(e: Estimated) -> list[str]:
         f"{'increments correlate most':<26}{peak}",
         f"{'':<26}(that is the dead time, the plant's own lag, and a row)",
     ]
+    if e.echoes:
+        kept = e.peak.observation in e.echoes
+        left = "the answer may not be the plant's: name others with --observations" if kept else "left out"
+        lines.append(f"{', '.join(e.echoes)} {'repeats' if len(e.echoes) == 1 else 'repeat'} a command: {left}")
     if len(e.windows) > 1:
         parts = ", ".join(f"{delay * 1e3:.4g}" for _, delay in e.windows)
         lines.append(f"{'in parts of the log':<26}{parts} ms")

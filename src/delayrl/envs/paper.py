@@ -107,16 +107,21 @@ def restore_physics(base: Any) -> None:
 
 
 def fingerprint(env: gymnasium.Env[Any, Any]) -> str:
-    """Hash the physics of a Gymnasium MuJoCo environment to 16 hexadecimal digits.
+    """Hash the physics of an environment to 16 hexadecimal digits.
 
     The hash covers the sizes, the model's constants (to 6 digits), and the state that 20 steps with fixed pseudo-random
     controls lead to from the model's initial state (to 1e-5). It ignores rewards, terminations and wrappers. The same
     physics may have other hashes under other MuJoCo versions, so compare within one version. The steps run in a
     simulation of their own and do not change `env`.
+
+    Raises:
+        DelayRLError: `env` is not a Gymnasium MuJoCo environment.
     """
+    base: Any = env.unwrapped
+    if not hasattr(base, "model") or not hasattr(base, "frame_skip"):
+        raise DelayRLError(f"a fingerprint needs a Gymnasium MuJoCo environment, not {type(base).__name__}")
     import mujoco
 
-    base: Any = env.unwrapped
     model = base.model
     sizes = base.observation_space.shape, base.action_space.shape, (base.frame_skip, model.nq, model.nv)
     digest = hashlib.sha256(repr(sizes).encode())

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ORDER = 10  # rows of the past in a model; fewer if the log is short for its width
+ECHO = 0.95  # correlation of increments at which an observation is a command that comes back, and no plant's answer
 CHANCE = 1e-3  # probability that any lag of unrelated signals is taken for an onset
 SHARE = 0.2  # least strength of the onset, relative to the strongest lag: nonlinear feedback leaves traces before it
 OUTLIER = 5.0  # standard deviations at which innovations are clipped: falls, collisions, wrap-around of angles
@@ -45,6 +46,13 @@ def increments(values: Array, episode: Array) -> Array:
     change = np.diff(values, axis=0, prepend=values[:1])
     change[1:][episode[1:] != episode[:-1]] = 0
     return _standard(change)
+
+
+def echoes(commands: Array, observations: Array, episode: Array) -> Mask:
+    """Return which observations repeat a command of their row, or of the row before, such as a set-point: [Y]."""
+    u, y = increments(commands, episode), increments(observations, episode)
+    same, before = u.T @ y / len(u), u[:-1].T @ y[1:] / len(u)
+    return (np.maximum(np.abs(same), np.abs(before)) > ECHO).any(0)
 
 
 def innovations(commands: Array, observations: Array, episode: Array) -> tuple[Array, Array]:

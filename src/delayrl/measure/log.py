@@ -3,7 +3,7 @@
 import warnings
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,7 @@ class Estimated:
     renewed: float | None = None  # correlation only: seconds between two changes of the observation, the median
     windows: tuple[tuple[float, float], ...] = ()  # (middle in seconds, dead time) of each part that shows one
     replay: tuple[tuple[int, int], ...] = ()  # stamps only: what `save` writes, see `ages.replay`
+    echoes: tuple[str, ...] = ()  # correlation only: observations that repeat a command
     longest: float = 0.0  # the largest delay of a window or an observation, in seconds
     slowest_warm_up: float | None = None  # stamps only: the largest delay during the warm-up, in seconds
     drift: float | None = None  # stamps only: growth of the smallest delays, in parts per million: clocks run apart
@@ -168,12 +169,22 @@ def from_log(
         estimated = _from_stamps(path, *exact, period, warm_up)
     else:
         log, row = reading.resample(reading.read_signals(table, time, commands, observations, episode, unit))
+        log, echoes = _without_echoes(log)
         warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
-        estimated = _correlated(path, log, row, period or row, longest, warm, seed)
-    if reading.in_doubt(estimated.row, given):
-        line = f"the rows of {path} lie {estimated.row:.3g} s apart: if its time stamps are not in seconds, say so"
-        warnings.warn(f"{line} (--unit {reading.likely_unit(estimated.row)})", DelayWarning, stacklevel=2)
+        estimated = replace(_correlated(path, log, row, period or row, longest, warm, seed), echoes=echoes)
+    if doubt := reading.doubt(estimated.row, estimated.period, given):
+        warnings.warn(f"{path}: {doubt}", DelayWarning, stacklevel=2)
     return estimated
+
+
+def _without_echoes(log: reading.Log) -> tuple[reading.Log, tuple[str, ...]]:
+    """Return the log without observations that repeat a command, and their names. If all do, they stay."""
+    echo = correlate.echoes(log.commands, log.observations, log.episode)
+    names = tuple(name for name, repeats in zip(log.observation_names, echo, strict=True) if repeats)
+    if echo.all() or not names:
+        return log, names
+    left = tuple(name for name in log.observation_names if name not in names)
+    return replace(log, observations=log.observations[:, ~echo], observation_names=left), names
 
 
 def _from_stamps(
@@ -186,6 +197,8 @@ def _from_stamps(
     if delays.min() < 0:
         row = int(np.argmin(delays))
         hint = "the clocks differ by at least that; synchronise them (PTP, NTP), or stamp both ends with one clock"
+        if delays.max() < 0:
+            hint = "--stamp and --received are swapped, or " + hint
         raise DelayRLError(f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made: {hint}")
     # a row of the control loop may show the observation of the row before
     first = np.append(True, ~inside | (gaps > 0))
@@ -315,35 +328,3 @@ def _pairs(
             pairs.append((Pair(command, observation, lag * row, r), near[:, i, j]))
     pairs.sort(key=lambda pair: -abs(pair[0].r))
     return tuple(pair for pair, _ in pairs), pairs[0][1]
-
-
-def plot(estimated: Estimated, out: str | Path) -> None:
-    """Plot how far each lag is from chance, or with stamps how often each delay occurs.
-
-    The suffix of `out` sets the format. Raises DelayRLError if matplotlib does not know it.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    if Path(out).suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
-        raise DelayRLError(f"--plot takes a .png, .svg or .pdf file; got {out}")
-    if estimated.method == "stamps":
-        axes.bar(list(estimated.counts), list(estimated.counts.values()), color="#1f6feb")
-        axes.set(xlabel=f"steps of {estimated.period * 1e3:g} ms", ylabel="observations")
-    else:
-        lag, strength, r = np.array(estimated.curve).T
-        axes.axvspan(estimated.low * 1e3, estimated.high * 1e3, color="#1a7f37", alpha=0.2, label="dead time, 95 %")
-        axes.axvline(estimated.delay * 1e3, color="#1a7f37")
-        axes.plot(lag * 1e3, strength, color="#1f6feb", marker=".", label="innovations, 1 = chance")
-        axes.set(xlabel="dead time, ms", ylabel="strength of the response", yscale="symlog", ylim=(0, None))
-        shown = 1e3 * max(4 * estimated.high, 2 * estimated.peak.lag if estimated.peak else 0)
-        axes.set(xlim=(0, min(shown, lag[-1] * 1e3)))
-        axes.axhline(1, color="#8c8c8c", linewidth=1, linestyle="--")
-        other = axes.twinx()
-        other.plot(lag * 1e3, np.abs(r), color="#d1242f", alpha=0.7, label="increments, |r| of the best pair")
-        other.set(ylabel="|r| of increments", ylim=(0, None))
-        lines = [*axes.get_legend_handles_labels()[0], *other.get_legend_handles_labels()[0]]
-        axes.legend(handles=lines, frameon=False)
-    axes.set(title=f"{Path(estimated.path).name}: train with --delay {estimated.train_with}")
-    figure.savefig(out, dpi=130)

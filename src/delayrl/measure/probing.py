@@ -86,7 +86,7 @@ def probe(
     if episodes < 1 or longest < 1:
         raise DelayRLError(f"episodes and longest count from 1; got {episodes} and {longest}")
     made = nullcontext(env) if isinstance(env, gym.Env) else closing(as_task(env).make())
-    with made as task, one_line(f"{task} failed while it was played"):
+    with made as task, one_line(f"{name_of(task)} failed while it was played"):
         return _probe(task, episodes, seed, longest, wrap)
 
 

@@ -61,7 +61,7 @@ def push(
     count = min(count or steps, length - 1)
     effect = {name: np.full((count, length), -1, np.int8) for name in ("obs", "state", "rest")}
     components = np.full((count, base.obs.shape[1]), -1)
-    echo = np.zeros(components.shape, bool)
+    echo, seen = np.zeros(components.shape, bool), []
     for k in range(count):
         pushed = chosen.copy()
         pushed[k] = ((low + high) / 2 + scale * signs[k] * (high - low) / 2).astype(chosen.dtype)
@@ -70,10 +70,15 @@ def push(
         different = differs(base.obs[:played], roll.obs[:played])
         components[k] = first(different.T.astype(np.int8))
         echo[k] = _echo(components[k], base.obs, roll.obs, chosen[k], pushed[k])
-        effect["obs"][k, :played] = (different & ~echo[k]).any(1)
+        seen.append(different)
         effect["state"][k, :played] = differs(base.state[:played], roll.state[:played]).any(1)
         effect["rest"][k, :played] = differs(base.rest[:played], roll.rest[:played]).any(1)
-    return Pushes(**effect, components=np.where(echo, -1, components), echo=echo, state_from=base.state_from)
+    repeats = echo.any(
+        0
+    )  # for all pushes: an error that is computed from an action repeats it only where all else is 0
+    for k, different in enumerate(seen):
+        effect["obs"][k, : len(different)] = (different & ~repeats).any(1)
+    return Pushes(**effect, components=np.where(repeats, -1, components), echo=echo, state_from=base.state_from)
 
 
 def play(env: Env, seed: int, chosen: Array) -> Rollout:

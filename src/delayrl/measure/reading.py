@@ -15,6 +15,7 @@ from delayrl.measure.correlate import Array
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PREFIXES = {"commands": ("command", "cmd", "action"), "observations": ("observation", "obs")}
 GAP = 20  # rows that may be missing within one recording
+FEWEST, MOST = 0.1, 1000  # rows in a period of control, beyond which one of the two units is doubtful
 SLOW = 2.0  # seconds between rows, beyond which the unit is doubtful
 
 
@@ -88,14 +89,17 @@ def read_stamps(
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit], table.recordings(episode)
 
 
-def in_doubt(row: float, unit: str | None) -> bool:
-    """Return whether rows lie so many seconds apart that their unit is doubtful, and nobody gave one."""
-    return unit is None and row > SLOW
+def doubt(row: float, period: float, unit: str | None) -> str:
+    """Return why the unit of time stamps, or that of the period, is in doubt, if it is; else an empty text.
 
-
-def likely_unit(row: float) -> str:
-    """Return the unit that time stamps may have where rows seem to lie so many seconds apart."""
-    return next((name for name in ("ms", "us") if row * UNITS[name] <= SLOW), "ns")
+    Rows lie so many seconds apart that nobody gave a unit for them, or far too many or few for a period of control.
+    """
+    if unit is None and row > SLOW:
+        likely = next((name for name in ("ms", "us") if row * UNITS[name] <= SLOW), "ns")
+        return f"its rows lie {row:.3g} s apart: if its time stamps are not in seconds, say so (--unit {likely})"
+    if (unit is None and period < FEWEST * row) or period > MOST * row:
+        return f"its rows lie {row:.3g} s apart, and the period is {period:.3g} s: check --unit, and that of --period"
+    return ""
 
 
 def resample(log: Log) -> tuple[Log, float]:

@@ -1,5 +1,6 @@
 """Reset and step environments whose code is the user's: what it raises becomes one line that says where."""
 
+import sysconfig
 import traceback
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,9 @@ import numpy as np
 
 from delayrl.envs.making import name_of
 from delayrl.errors import DelayRLError, described
+
+LIBRARIES = (str(Path(__file__).parents[1]), *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")))
+"""Where code lies that is not the user's."""
 
 
 def reset(env: Any, seed: int) -> tuple[Any, dict[str, Any]]:
@@ -45,6 +49,7 @@ def _check_shape(env: Any, truth: Any) -> None:
 
 
 def _one_line(env: Any, method: str, error: Exception) -> DelayRLError:
-    place = traceback.extract_tb(error.__traceback__)[-1]
+    frames = traceback.extract_tb(error.__traceback__)
+    place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]
     where = f"{Path(place.filename).name}, line {place.lineno}"
     return DelayRLError(f"{name_of(env)} failed in {method}: {described(error)} ({where})")

@@ -43,7 +43,8 @@ class Setting:
 class Counting:
     """A policy whose n-th action is n, and which records its inputs."""
 
-    action_size, dt = 1, DT
+    action_size = 1
+    dt: float | None = None
     low, high = np.float32([-1e6]), np.float32([1e6])
 
     def __init__(self, obs_size: int, max_age: int) -> None:
@@ -225,6 +226,7 @@ def play(setting: Setting, events: list[Event]) -> dict[str, int]:
     """Give the same events to a controller and to the oracle, which must agree; return counts of what happened."""
     world = 0.0  # the clock
     policy = Counting(setting.obs_size, setting.max_age)
+    policy.dt = setting.period
     controller = Controller(
         policy,
         stamps="seconds" if setting.seconds else "steps",

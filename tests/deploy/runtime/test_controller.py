@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from oracle import Counting, Setting, draw_events, draw_setting, play
 
 from delayrl.deploy import ClockError, Controller, OverrunError, Statistics
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.wrappers import Delayed
 
 
@@ -208,6 +208,7 @@ def test_an_episode_begins_with_the_newest() -> None:
 
 def test_stamps_that_repeat_after_the_clock_stepped_back_are_late() -> None:
     policy = counting(4)
+    policy.dt = 1 / 16
     controller = Controller(policy, stamps="seconds", min_age=4)
     tenths = policy.dt / 10  # so that no stamp is that of one before
     for step in range(30):
@@ -220,6 +221,16 @@ def test_stamps_that_repeat_after_the_clock_stepped_back_are_late() -> None:
 
 def counting(max_age: int = 3) -> Counting:
     return Counting(1, max_age)
+
+
+def test_another_period_than_that_of_training_is_told() -> None:
+    """As where milliseconds stand for seconds: all commands would fall into one step."""
+    policy = counting()
+    policy.dt = 0.04
+    with pytest.warns(DelayWarning, match=r"learned with steps of 0.04 s; got dt = 40 s: ages are counted in these"):
+        Controller(policy, stamps="seconds", dt=40)
+    Controller(policy, stamps="seconds")
+    Controller(policy, stamps="seconds", dt=0.041)
 
 
 def test_actions_are_counted_not_the_clock() -> None:

@@ -28,6 +28,7 @@ flight are in the history, and an observation that is made now has the age κ.
 
 import threading
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal, Protocol, get_args
@@ -37,7 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.runtime.episode import Action, Arrival, Clock, Episode, History, Stamps
 from delayrl.deploy.runtime.telemetry import Statistics, Telemetry, served
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, DelayWarning
 
 OnOverrun = Literal["hold", "clip", "raise"]
 """What `act` does while the newest observation is older than the policy's longest age Δ.
@@ -112,7 +113,11 @@ class Controller:
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
         self.action_delay = _steps(policy, "action_delay", action_delay)
         self.min_age = _steps(policy, "min_age", min_age)
-        self._clock = Clock(stamps, getattr(policy, "dt", None) if stamps == "seconds" and dt is None else dt, clock)
+        learned = getattr(policy, "dt", None)
+        self._clock = Clock(stamps, learned if stamps == "seconds" and dt is None else dt, clock)
+        if stamps == "seconds" and learned and not 0.9 < self._clock.period / learned < 1.1:
+            line = f"the policy learned with steps of {learned:g} s; got dt = {self._clock.period:g} s"
+            warnings.warn(f"{line}: ages are counted in these", DelayWarning, stacklevel=2)
         steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
