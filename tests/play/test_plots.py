@@ -1,17 +1,25 @@
 """Pictures of runs: their names are text, not formulas."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 
 from delayrl.play import plots
+from delayrl.play.run import Run
 
 
 def test_names_with_two_dollar_signs(tmp_path: Path) -> None:
     """A task's keyword argument may hold them, such as a path. Between them matplotlib reads a formula."""
     name = 'my_tasks:Arm(model="$HOME/my_$arm")'
     row = {"agent": name, "env": name, "delay": name, "seed": 0, "policy": "agent", "step": 1, "return": 1.0}
-    plots.curve([row], tmp_path / "curve.png")
+    row |= {"episode": 0, "reset_seed": 1, "length": 9}
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "rows.jsonl").write_text(json.dumps(row) + "\n")
+    config = {"format": 1, "preset": "small", "hyperparameters": {}, "schedule": {"steps": 1}}
+    (folder / "config.json").write_text(json.dumps(config | row))
+    plots.curve(Run(folder), tmp_path / "curve.png")
     plots.against_delay([row | {"delay": 1, "returns": [1.0], "episodes": 1}], tmp_path / "delays.png")
     plots.curves([(name, np.ones(1), np.ones((2, 1)))], tmp_path / "curves.png", name)
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.glob("*.png"))) == 3

@@ -12,6 +12,7 @@ from delayrl.deploy.packing import check_same, pack, space_json
 from delayrl.envs.making import make, seconds_of
 from delayrl.envs.task import Task, TaskLike, closing, stored_task
 from delayrl.play.policy import Policy, restored
+from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
 from delayrl.run.arrays import flatten_tree
 from delayrl.run.folder import RunFolder, RunLike, path_of
@@ -117,11 +118,10 @@ def describe(run: RunFolder, config: dict[str, Any], step: int, policy: Policy, 
 
 
 def _evaluation(run: RunFolder, config: dict[str, Any], step: int) -> dict[str, Any] | None:
-    """Summarise the last evaluation up to the checkpoint at `step`; None if there was none."""
-    rows = [row for row in run.read("rows") if row["policy"] == "agent" and row["step"] <= step]
-    if not rows:
+    """Summarise the last whole evaluation up to the checkpoint at `step`; None if there was none."""
+    steps, returns = Run(run.path).curve()
+    if not (steps <= step).any():
         return None
-    last = max(row["step"] for row in rows)
-    returns = [row["return"] for row in rows if row["step"] == last]
-    moments = {"mean_return": float(np.mean(returns)), "std_return": deviation(returns)}
-    return {"step": last, "episodes": len(returns), **moments, "protocol": config.get("protocol")}
+    last, played = steps[steps <= step][-1], returns[steps <= step][-1]
+    moments = {"mean_return": float(played.mean()), "std_return": deviation(played)}
+    return {"step": int(last), "episodes": len(played), **moments, "protocol": config.get("protocol")}

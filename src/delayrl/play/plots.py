@@ -1,6 +1,5 @@
 """Figures of one run: returns against steps, and against the delay."""
 
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,43 +8,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.run.rows import plain_text, whole_evaluations
+from delayrl.play.run import Run
+from delayrl.run.rows import plain_text
 
-COLOURS = {"agent": "#1f6feb", "reference": "#8c8c8c"}
+Line = tuple[str, NDArray[Any], NDArray[Any]]
+
+COLOUR, GREY = "#1f6feb", "#8c8c8c"
 
 
-def curve(rows: list[dict[str, Any]], path: Path) -> None:
+def curve(run: Run, path: Path) -> None:
     """Draw the learning curve of a run: the mean and the range of each whole evaluation's returns, against steps."""
-    if not rows:
-        return
-    returns: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        returns[row["policy"]][row["step"]].append(row["return"])
-    first = rows[0]
-    with _axes(path) as axes:
-        for policy, points in returns.items():
-            label = f"{first['agent']}, delay {first['delay']}" if policy == "agent" else "its reference, no delay"
-            steps = whole_evaluations(points)
-            _band(axes, steps, [points[step] for step in steps], COLOURS[policy], label)
-        axes.set(xlabel="environment steps", ylabel="return", title=plain_text(f"{first['env']}, seed {first['seed']}"))
-        axes.legend(frameon=False)
+    config, drawn = run.config, []
+    for policy, label in (("agent", f"{config['agent']}, delay {run.delay}"), ("reference", "its reference, no delay")):
+        steps, returns = run.curve(policy)
+        if len(steps):
+            drawn.append((label, steps, returns.T))
+    if drawn:
+        title = f"{config['env']}, seed {config['seed']}"
+        _curves(drawn, path, title, "return", (COLOUR, GREY))
 
 
 def against_delay(results: list[dict[str, Any]], path: Path) -> None:
     """Draw the returns of one policy against the delay: mean and range of the episodes that `sweep` yields."""
     first = results[0]
     with _axes(path) as axes:
-        _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOURS["agent"], first["agent"])
+        _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOUR, first["agent"])
         title = plain_text(f"{first['env']}, one policy, {first['episodes']} episodes a point")
         axes.set(xlabel="delay of the observations (steps)", ylabel="return", title=title)
 
 
-def curves(groups: Sequence[tuple[str, NDArray[Any], NDArray[Any]]], path: Path, title: str) -> None:
+def curves(groups: Sequence[Line], path: Path, title: str) -> None:
     """Draw learning curves beside each other: for each label and its steps, [N], mean and range of [seeds, N]."""
+    _curves(groups, path, title, "return, mean and range of the seeds", [f"C{number}" for number in range(len(groups))])
+
+
+def _curves(groups: Sequence[Line], path: Path, title: str, what: str, colours: Sequence[str]) -> None:
     with _axes(path) as axes:
-        for number, (label, steps, returns) in enumerate(groups):
-            _band(axes, list(steps), list(returns.T), f"C{number}", label)
-        axes.set(xlabel="environment steps", ylabel="return, mean and range of the seeds", title=plain_text(title))
+        for (label, steps, returns), colour in zip(groups, colours, strict=False):
+            _band(axes, list(steps), list(returns.T), colour, label)
+        axes.set(xlabel="environment steps", ylabel=what, title=plain_text(title))
         axes.legend(frameon=False)
 
 

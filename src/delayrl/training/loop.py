@@ -50,7 +50,7 @@ def run(group: Group, state: TrainState, note: Callable[[str], None], stopped: C
         with tqdm(total=steps, initial=state.step, unit="step", **options) as bar, closing(recorder):
             Loop(group, state, recorder).train(stopped, bar)
     for folder in group.folders:
-        curve(folder.read("rows"), folder.path / "curve.png")
+        curve(Run(folder.path), folder.path / "curve.png")
 
 
 class Loop:

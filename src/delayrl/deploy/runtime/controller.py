@@ -113,11 +113,8 @@ class Controller:
         self.policy, self.stamps, self.on_overrun = policy, stamps, on_overrun
         self.action_delay = _steps(policy, "action_delay", action_delay)
         self.min_age = _steps(policy, "min_age", min_age)
-        learned = getattr(policy, "dt", None)
-        self._clock = Clock(stamps, learned if stamps == "seconds" and dt is None else dt, clock)
-        if stamps == "seconds" and learned and not 0.9 < self._clock.period / learned < 1.1:
-            line = f"the policy learned with steps of {learned:g} s; got dt = {self._clock.period:g} s"
-            warnings.warn(f"{line}: ages are counted in these", DelayWarning, stacklevel=2)
+        self._clock = Clock(stamps, getattr(policy, "dt", None) if stamps == "seconds" and dt is None else dt, clock)
+        _compare(policy, self._clock)
         steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
@@ -290,6 +287,14 @@ def _check(policy: ControlPolicy) -> None:
     if not low.shape == high.shape == (policy.action_size,) or not (low <= high).all():
         line = f"the policy's low and high are {policy.action_size} numbers each, none of low above that of high"
         raise DelayRLError(f"{line}; got {low.tolist()} and {high.tolist()}")
+
+
+def _compare(policy: ControlPolicy, clock: Clock) -> None:
+    """Warn if steps are far from as long as those that the policy learned with."""
+    learned = getattr(policy, "dt", None)
+    if clock.stamps == "seconds" and learned and not 0.9 < clock.period / learned < 1.1:
+        line = f"the policy learned with steps of {learned:g} s; got dt = {clock.period:g} s"
+        warnings.warn(f"{line}: ages are counted in these", DelayWarning, stacklevel=3)
 
 
 def _in_range(policy: ControlPolicy, action: Action) -> Action:
