@@ -244,15 +244,8 @@ def _from_stamps(
 def _correlated(
     path: Path, log: reading.Log, row: float, period: float, longest: float | None, warm: float, seed: int
 ) -> Estimated:
-    used = log.time >= warm - row / 2
-    rows = int(used.sum())
-    if rows < LEAST_ROWS:
-        counted = f"{rows} rows after a warm-up of {warm:g} s"
-        raise DelayRLError(f"{path} is too short: {counted}; {LEAST_ROWS} are needed, better 1,000")
-    commands, observations, episode = log.commands[used], log.observations[used], log.episode[used]
-    for values, what in ((commands, "command"), (observations, "observation")):
-        if (values == values[0]).all():
-            raise DelayRLError(f"{path}: after a warm-up of {warm:g} s every {what} is constant")
+    commands, observations, episode = _used(path, log, row, warm)
+    rows = len(episode)
     lags = min(100, rows // 10) if longest is None else int(np.ceil(longest / row)) + 1
     if lags > rows // 6:
         tried = f"a delay of {lags * row:g} s: at most {rows // 6 * row:.3g} s"
@@ -266,14 +259,7 @@ def _correlated(
         hint = "A longer log, other columns, or commands with some random variation may show one"
         unseen = f"no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance"
         raise DelayRLError(f"{path}: {unseen}. {hint}")
-    random, dead_times = np.random.default_rng(seed), []
-    for _ in range(RESAMPLINGS):  # blocks are drawn with replacement
-        weights = np.bincount(random.integers(0, blocks, blocks), minlength=blocks).astype(float)
-        lag = correlate.onset(correlate.correlation(sums, size, lags, weights))
-        if lag is not None:
-            dead_times.append((lag - 1) * row)
-    low, high = np.quantile(dead_times, (0.025, 0.975)) if dead_times else (0.0, lags * row)
-    low, high = max(0.0, low - row), high + row  # the log does not show what happens between two rows
+    low, high = _interval(sums, size, lags, row, seed)
     windows, count = [], min(WINDOWS, rows // WINDOW_ROWS)
     for part in np.array_split(np.arange(len(sums)), count) if count > 1 else []:
         lag = correlate.onset(correlate.correlation(sums[part], size, lags))
@@ -289,8 +275,8 @@ def _correlated(
         method="correlation",
         path=str(path),
         delay=delay,
-        low=float(low),
-        high=float(high),
+        low=low,
+        high=high,
         row=row,
         period=period,
         rows=rows,
@@ -307,6 +293,31 @@ def _correlated(
         longest=max([delay, *(d for _, d in windows)]),
         curve=tuple((lag * row, float(strength[lag]), float(r[lag])) for lag in range(lags)),
     )
+
+
+def _used(path: Path, log: reading.Log, row: float, warm: float) -> tuple[Array, Array, Array]:
+    """Return commands, observations and episodes after the warm-up. Raises DelayRLError if they show nothing."""
+    used = log.time >= warm - row / 2
+    if used.sum() < LEAST_ROWS:
+        counted = f"{used.sum()} rows after a warm-up of {warm:g} s"
+        raise DelayRLError(f"{path} is too short: {counted}; {LEAST_ROWS} are needed, better 1,000")
+    commands, observations = log.commands[used], log.observations[used]
+    for values, what in ((commands, "command"), (observations, "observation")):
+        if (values == values[0]).all():
+            raise DelayRLError(f"{path}: after a warm-up of {warm:g} s every {what} is constant")
+    return commands, observations, log.episode[used]
+
+
+def _interval(sums: Array, size: int, lags: int, row: float, seed: int) -> tuple[float, float]:
+    """Return the 95 % interval of the dead time: blocks are drawn again, with replacement."""
+    random, dead_times = np.random.default_rng(seed), []
+    for _ in range(RESAMPLINGS):
+        weights = np.bincount(random.integers(0, len(sums), len(sums)), minlength=len(sums)).astype(float)
+        lag = correlate.onset(correlate.correlation(sums, size, lags, weights))
+        if lag is not None:
+            dead_times.append((lag - 1) * row)
+    low, high = np.quantile(dead_times, (0.025, 0.975)) if dead_times else (0.0, lags * row)
+    return max(0.0, float(low) - row), float(high) + row  # the log does not show what happens between two rows
 
 
 def _renewed(observations: Array, episode: Array) -> float:
