@@ -68,7 +68,8 @@ def trained(
     monkeypatch.setattr(loop, "save", save)
     monkeypatch.setattr(loop, "Actor", Watched)
     actors = [Watched(make("delayrl/Counter-v0", 2, rescale=True), seed, False, protocol) for seed in SEEDS]
-    setup = SimpleNamespace(schedule=schedule, delay=as_delay(2), protocol=protocol)
+    agent = SimpleNamespace(privileged=False)
+    setup = SimpleNamespace(agent=agent, schedule=schedule, delay=as_delay(2), protocol=protocol)
     group: Any = SimpleNamespace(
         setup=setup, seeds=SEEDS, keys=None, spec=Spec(2, 1, 2), program=Fake(), ways=Ways(), apply=map, folders=[]
     )
