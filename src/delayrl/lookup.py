@@ -151,4 +151,5 @@ def contents(thing: Any, skipped: Collection[str] = ()) -> Any:
     if isinstance(thing, str | int | float):
         return thing
     name = name_of_object(thing) if callable(thing) else "<>"
-    return None if name.startswith("<") else name
+    private = any(part.startswith("_") for part in name.partition(":")[0].split("."))  # where a library may move it
+    return None if name.startswith("<") else name.partition(":")[2] if private else name

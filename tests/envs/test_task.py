@@ -394,6 +394,12 @@ def test_a_dt_that_is_no_time_is_told(dt: Any, words: str, monkeypatch: pytest.M
         assert seconds_of(env) is None
 
 
+def test_torques_are_no_times() -> None:
+    env = TimeLimit(Arm(), 20)
+    env.unwrapped.tau = np.zeros(2)  # type: ignore[attr-defined]
+    assert seconds_of(env) is None
+
+
 def test_errors_name_the_last_line_of_the_users_code() -> None:
     """Not that of a library which it calls, or of a wrapper around it."""
 

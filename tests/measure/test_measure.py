@@ -385,10 +385,11 @@ def test_commands_that_come_back_are_no_answer(
         assert e.echoes == (name,)
         assert (e.delay, e.low, e.high, e.peak) == (alone.delay, alone.low, alone.high, alone.peak)
     main(["measure", str(path)])
-    assert "obs_scaled repeats a command: left out" in capsys.readouterr().out
+    assert "obs_scaled repeats a command" in (shown := capsys.readouterr().out)
+    assert "left out; if it is a sensor, name it alone" in shown
     alike = write(tmp_path / "only.csv", {"time": ROW * np.arange(len(u)), "command": u, "obs_last": last})
     main(["measure", str(alike)])
-    assert "obs_last repeats a command: the answer may not be the plant's" in capsys.readouterr().out
+    assert "the answer may not be the plant's; name others" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -398,7 +399,7 @@ def test_commands_that_come_back_are_no_answer(
         ({"period": 25.0}, True),
         ({"period": 25.0, "unit": "s"}, True),
         ({"period": 0.001}, True),
-        ({"period": 0.001, "unit": "s"}, False),
+        ({"period": 0.001, "unit": "s"}, True),
         ({"unit": "us"}, False),
     ],
 )
@@ -408,6 +409,56 @@ def test_units_that_do_not_fit_each_other(words: dict, doubtful: bool, tmp_path:
     with warnings.catch_warnings(record=True, action="always") as caught:
         from_log(log(tmp_path / "log.csv", u, y), **words)
     assert [str(w.message).endswith("check --unit, and that of --period") for w in caught] == [True] * doubtful
+
+
+def test_a_given_unit_is_believed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It warns, and recommends a delay. By stamps nothing is in doubt where a sensor is slow."""
+    path = str(log(tmp_path / "log.csv", *signals("servo", 3, 600)))
+    for more, recommended in (([], False), (["--unit", "s"], True)):
+        with warnings.catch_warnings(action="default"):
+            main(["measure", path, "--period", "1ms", *more])
+        said = capsys.readouterr()
+        assert "check --unit" in said.err
+        assert ("train with: --delay" in said.out) == recommended
+    slow = from_log(stamps(tmp_path / "stamps.csv", np.arange(60.0), 0.1), 0.02)
+    assert slow.step == 5
+
+
+def test_smooth_commands_make_no_echo(tmp_path: Path) -> None:
+    """Their increments are alike for some rows, so those of a plant that answers rows later are like theirs at once."""
+    rng = np.random.default_rng(0)
+    u = np.convolve(rng.normal(size=3100), np.hanning(100), "valid")[:3000] + 0.05 * rng.normal(size=3000)
+    y = np.zeros(3000)
+    for t in range(5, 3000):
+        y[t] = 0.5 * y[t - 1] + 0.5 * u[t - 4]
+    e = from_log(write(tmp_path / "log.csv", {"time": ROW * np.arange(3000), "command": u, "obs": y, "obs_goal": u}))
+    assert e.echoes == ("obs_goal",)
+    assert e.low <= 3 * ROW <= e.high
+
+
+class Integrator(gym.Env):
+    """A position that starts at 0: the first action is all that it shows."""
+
+    observation_space, action_space = Box(-99, 99, (1,)), Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.zeros(1, np.float32)
+        return self.x.copy(), {}
+
+    def step(self, action):
+        self.x = self.x + action
+        return self.x.copy(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_a_position_that_begins_with_the_action_is_no_echo(delay: int) -> None:
+    def make_it() -> gym.Env:
+        env = gym.wrappers.TimeLimit(Integrator(), 100)
+        return DelayObservation(env, delay) if delay else env
+
+    p = probe(make_it, episodes=2, longest=20)
+    assert (sorted(p.total), p.echoes) == ([delay], ())
 
 
 def test_held_commands(tmp_path: Path) -> None:

@@ -87,16 +87,28 @@ def test_runs_of_an_own_agent_are_named_by_the_options_that_differ(tmp_path: Pat
     usual = {name: RunFolder(one.parent).config["hyperparameters"][name] for name in ("batch_size", "discount")}
     first = f"mine:Agent batch_size={usual['batch_size']} discount={usual['discount']}"
     assert finals(one, two) == {first: [1.0], "mine:Agent batch_size=64 discount=0.9": [2.0]}
-    assert "The code of" not in markdown(summary_of(one, two), "", {})
+    assert "The modules of" not in markdown(summary_of(one, two), "", {})
     assert finals(one) == {"mine:Agent": [1.0]}
     later = renamed(made(tmp_path / "c", 3.0, seed=1), "mine:Agent", "2b")
-    assert "The code of mine:Agent is not the same in all runs" in markdown(summary_of(one, later), "", {})
+    assert "The modules of mine:Agent changed between its runs" in markdown(summary_of(one, later), "", {})
 
 
 def test_one_run_in_two_folders_is_one_line(tmp_path: Path) -> None:
     twice = made(tmp_path / "a", 1.0), made(tmp_path / "b", 1.0)
     with pytest.raises(DelayRLError, match=r"a/rows.jsonl and .*b/rows.jsonl hold runs of the same options and seed"):
         summary_of(*twice)
+    with pytest.raises(DelayRLError, match=r"a/rows.jsonl is given twice"):
+        summary_of(twice[0], twice[0])
+
+
+def test_rows_with_and_without_their_configuration(tmp_path: Path) -> None:
+    """Nothing is known of one of them, so the hash names both."""
+    made_of = [made(tmp_path / "a", 1.0), made(tmp_path / "b", 2.0, discount=0.9)]
+    known, unknown = (renamed(rows, "mine:Agent", "1a") for rows in made_of)
+    hashes = [RunFolder(path.parent).config["configuration"][:8] for path in (known, unknown)]
+    (unknown.parent / "config.json").unlink()
+    labels = [f"mine:Agent configuration={name}" for name in hashes]
+    assert finals(known, unknown) == dict(zip(labels, ([1.0], [2.0]), strict=True))
 
 
 def test_runs_that_began_otherwise_say_so_and_are_no_reference(tmp_path: Path) -> None:

@@ -173,6 +173,18 @@ def test_rows_go_on_to_name_the_task_that_the_run_began_with(tmp_path: Path) -> 
         delayrl.go_on(run, 400, env=lambda: gym.make("Reacher-v5"), progress=False)
 
 
+def test_a_task_without_a_name_in_a_wrapper_with_one(tmp_path: Path) -> None:
+    """As text it is not looked up, as a class it is, and going on looks it up: one task."""
+    arm = lambda: gym.make("Reacher-v5")  # noqa: E731
+    given: dict[str, Any] = {"env": arm, "steps": 100, "random_steps": 100}
+    run = train(
+        "random", tmp_path / "run", wrappers=["gymnasium.wrappers.transform_observation:FlattenObservation"], **given
+    )
+    assert "unnamed" in run.config
+    train("random", tmp_path / "run", wrappers=[gym.wrappers.FlattenObservation], **given)
+    delayrl.go_on(run, 200, env=arm, progress=False)
+
+
 def test_a_finished_run_gives_up_its_replay_when_asked_to(tmp_path: Path) -> None:
     run = train("random", tmp_path / "run", steps=200)
     assert (run.path / "replay").exists()

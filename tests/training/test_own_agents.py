@@ -260,7 +260,6 @@ def test_entry_points_are_names(tmp_path: Path, monkeypatch, capsys) -> None:
         ("own_agents:Needy", "fields need defaults: TypeError: .*'width'"),
         ("own_agents:Thawed", "must be a frozen dataclass, with tuples for lists: TypeError: unhashable"),
         ("own_agents:Steps", "has an option steps, as every run has"),
-        ("own_agents:Progress", "has an option progress, as every run has"),
         ("own_agents:Twice", "has two options factor with different values, and one name sets both"),
         ("own_agents:Wordy", "name must be a number; got 'me'"),
         ("not_there:Agent", "cannot import 'not_there': ModuleNotFoundError"),
@@ -326,6 +325,9 @@ def test_no_option_is_named_as_a_parameter_of_train() -> None:
     assert {*inspect.signature(delayrl.train).parameters} - {"values"} == TAKEN
     ours = {name for known in AGENTS.values() for preset in known.presets.values() for name in values_of(preset.agent)}
     assert not ours & TAKEN
+    with pytest.raises(DelayRLError, match="own_agents:Progress has an option progress, and so has"):
+        resolve("own_agents:Progress", make_arm, 3, "small", "corrected", {})
+    assert find_agent("own_agents:Progress").presets  # an older run of it is read
 
 
 NOTEBOOK = """

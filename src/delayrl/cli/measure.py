@@ -66,7 +66,7 @@ def run(given: argparse.Namespace) -> None:
             result.save(given.save)
         if given.plot:
             plot(result, given.plot)
-        doubtful = bool(doubt(result.row, result.period, given.unit))
+        doubtful = given.unit is None and doubt(result.row, result.period, None, result.method) != ""
         print(json.dumps(result.json()) if given.json else _show_log(result, given.save, doubtful))
         return
     _refuse(given, ("period", *COLUMNS, "unit", "warm_up", "plot", "save"), "a log", "an environment")
@@ -170,9 +170,12 @@ def _show_correlation(e: Estimated) -> list[str]:
         f"{'':<26}(that is the dead time, the plant's own lag, and a row)",
     ]
     if e.echoes:
+        lines.append(f"{', '.join(e.echoes)} {'repeats' if len(e.echoes) == 1 else 'repeat'} a command, and no sensor:")
         kept = e.peak.observation in e.echoes
-        left = "the answer may not be the plant's: name others with --observations" if kept else "left out"
-        lines.append(f"{', '.join(e.echoes)} {'repeats' if len(e.echoes) == 1 else 'repeat'} a command: {left}")
+        what = (
+            "the answer may not be the plant's; name others" if kept else "left out; if it is a sensor, name it alone"
+        )
+        lines.append(f"{'':<26}{what} (--observations)")
     if len(e.windows) > 1:
         parts = ", ".join(f"{delay * 1e3:.4g}" for _, delay in e.windows)
         lines.append(f"{'in parts of the log':<26}{parts} ms")

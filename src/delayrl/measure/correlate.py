@@ -49,10 +49,14 @@ def increments(values: Array, episode: Array) -> Array:
 
 
 def echoes(commands: Array, observations: Array, episode: Array) -> Mask:
-    """Return which observations repeat a command of their row, or of the row before, such as a set-point: [Y]."""
+    """Return which observations repeat a command of their row or of the row before, such as a set-point: [Y].
+
+    Increments of smooth commands are like those of some rows later, so an echo is most like a command at once.
+    """
     u, y = increments(commands, episode), increments(observations, episode)
-    same, before = u.T @ y / len(u), u[:-1].T @ y[1:] / len(u)
-    return (np.maximum(np.abs(same), np.abs(before)) > ECHO).any(0)
+    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in range(2 * ORDER)])  # [lags, U, Y]
+    early = r[:2].max(0)
+    return ((early > ECHO) & (early >= r.max(0))).any(0)
 
 
 def innovations(commands: Array, observations: Array, episode: Array) -> tuple[Array, Array]:

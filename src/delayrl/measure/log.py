@@ -172,7 +172,7 @@ def from_log(
         log, echoes = _without_echoes(log)
         warm = WARM_UP * len(log.time) * row if warm_up is None else warm_up
         estimated = replace(_correlated(path, log, row, period or row, longest, warm, seed), echoes=echoes)
-    if doubt := reading.doubt(estimated.row, estimated.period, given):
+    if doubt := reading.doubt(estimated.row, estimated.period, given, estimated.method):
         warnings.warn(f"{path}: {doubt}", DelayWarning, stacklevel=2)
     return estimated
 

@@ -24,7 +24,7 @@ from gymnasium.spaces import Box
 from delayrl.envs.making import name_of
 from delayrl.envs.task import TaskLike, as_task, closing
 from delayrl.errors import DelayRLError, one_line
-from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push
+from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push, repeating
 
 Counts = dict[int, int]  # {steps of delay: how often}
 
@@ -114,7 +114,7 @@ def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Ite
     if channel:
         action = _count(d for p in pushes for d in _settled(p, channel, oldest))
         observation = _count_ages([_shown(p.obs, p.channel(channel)) for p in pushes], oldest)
-    echo = np.concatenate([p.echo for p in pushes]).any(0)
+    echo = np.any([repeating(p.echo) for p in pushes], 0)
     reactions = np.concatenate([p.components - 1 - np.arange(len(p.obs))[:, None] for p in pushes])  # negative if none
     fewest = np.where(reactions >= 0, reactions, np.iinfo(int).max).min(0)
     return Probed(

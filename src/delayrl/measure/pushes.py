@@ -73,12 +73,19 @@ def push(
         seen.append(different)
         effect["state"][k, :played] = differs(base.state[:played], roll.state[:played]).any(1)
         effect["rest"][k, :played] = differs(base.rest[:played], roll.rest[:played]).any(1)
-    repeats = echo.any(
-        0
-    )  # for all pushes: an error that is computed from an action repeats it only where all else is 0
+    repeats = repeating(echo)
     for k, different in enumerate(seen):
-        effect["obs"][k, : len(different)] = (different & ~repeats).any(1)
-    return Pushes(**effect, components=np.where(repeats, -1, components), echo=echo, state_from=base.state_from)
+        effect["obs"][k, : len(different)] = (different & ~(repeats | echo[k])).any(1)
+    return Pushes(**effect, components=np.where(repeats | echo, -1, components), echo=echo, state_from=base.state_from)
+
+
+def repeating(echo: Array) -> Array:
+    """Return which components repeat actions, [C]: after several pushes, as an error that some pushes show alone does.
+
+    A position that starts at 0 may be the first action by chance. If no component were left, none counts.
+    """
+    repeats = echo.sum(0) > 1
+    return repeats & ~repeats.all()
 
 
 def play(env: Env, seed: int, chosen: Array) -> Rollout:

@@ -89,15 +89,16 @@ def read_stamps(
     return table.column(made) * UNITS[unit], table.column(arrived) * UNITS[unit], table.recordings(episode)
 
 
-def doubt(row: float, period: float, unit: str | None) -> str:
+def doubt(row: float, period: float, unit: str | None, method: str) -> str:
     """Return why the unit of time stamps, or that of the period, is in doubt, if it is; else an empty text.
 
-    Rows lie so many seconds apart that nobody gave a unit for them, or far too many or few for a period of control.
+    Rows lie so many seconds apart that nobody gave a unit for them, or far too many or few for a period of control. By
+    stamps a row is an observation, and a sensor may be slow.
     """
     if unit is None and row > SLOW:
         likely = next((name for name in ("ms", "us") if row * UNITS[name] <= SLOW), "ns")
         return f"its rows lie {row:.3g} s apart: if its time stamps are not in seconds, say so (--unit {likely})"
-    if (unit is None and period < FEWEST * row) or period > MOST * row:
+    if (method == "correlation" and period < FEWEST * row) or period > MOST * row:
         return f"its rows lie {row:.3g} s apart, and the period is {period:.3g} s: check --unit, and that of --period"
     return ""
 

@@ -1,5 +1,6 @@
 """Reset and step environments whose code is the user's: what it raises becomes one line that says where."""
 
+import os
 import sysconfig
 import traceback
 from pathlib import Path
@@ -10,7 +11,10 @@ import numpy as np
 from delayrl.envs.making import name_of
 from delayrl.errors import DelayRLError, described
 
-LIBRARIES = (str(Path(__file__).parents[1]), *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")))
+LIBRARIES = tuple(
+    os.path.join(str(path), "")  # so that a folder whose name only begins alike is none of them
+    for path in (Path(__file__).parents[1], *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")))
+)
 """Where code lies that is not the user's."""
 
 

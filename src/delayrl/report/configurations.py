@@ -28,8 +28,10 @@ def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
         if (path.parent / "config.json").is_file():
             config = RunFolder(path.parent).config
             same = json.dumps([config.get(name) for name in (*CONDITION, CONFIGURATION, "seed")])
-            if (other := first.setdefault(same, path)) is not path:
-                raise DelayRLError(f"{other} and {path} hold runs of the same options and seed; give one of them")
+            if other := first.get(same):
+                twice = f"{other} and {path} hold runs of the same options and seed; give one of them"
+                raise DelayRLError(f"{path} is given twice" if other.samefile(path) else twice)
+            first[same] = path
             yield config
             continue
         try:
@@ -86,8 +88,10 @@ def _apart(group: RowGroup, alike: Sequence[RowGroup]) -> dict[str, Any]:
     """Return what tells a group from others that have the same name, if their configurations differ."""
     if not group.configuration or len({other.configuration for other in alike}) < 2:
         return {}
+    named = {"configuration": group.configuration[:8]}
     configs = [group.config, *(other.config for other in alike if other.configuration != group.configuration)]
+    if not all(configs):
+        return named
     own, *others = ({**one.get("hyperparameters", {}), **one.get("schedule", {})} for one in configs)
     differing = {name: value for name, value in own.items() if any(other.get(name) != value for other in others)}
-    told = own not in others and all(configs)
-    return differing if told else {**differing, "configuration": group.configuration[:8]}
+    return differing | named if own in others else differing

@@ -252,7 +252,7 @@ def remarks(summary: Summary) -> list[str]:
         for env in summary.changed
     ]
     recoded = [
-        f"The code of {agent} is not the same in all runs: returns of different agents stand together."
+        f"The modules of {agent} changed between its runs: returns of different agents may stand together."
         for agent in summary.recoded
     ]
     return left_out + changed + recoded + overrides(summary)

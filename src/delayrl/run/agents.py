@@ -10,6 +10,7 @@ import difflib
 import hashlib
 import inspect
 import sys
+import sysconfig
 import warnings
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -25,13 +26,14 @@ from delayrl.run.configuration import OLDER, check_names, options, override, val
 from delayrl.run.folder import versions_in
 
 GROUP = "delayrl.agents"
+INSTALLED = tuple(map(sysconfig.get_path, ("purelib", "platlib")))
 AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
 TAKEN = {
     *("agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device"),
     *("overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress"),
 }
-"""Names of the parameters of `delayrl.train`, which takes an option of an agent by its name too."""
+"""The parameters of `delayrl.train`, which takes options by their names too."""
 PARTS = ("privileged", "ahead", "phases", "init", "act", "deterministic")
 """What the protocol `Agent` asks for."""
 
@@ -77,7 +79,8 @@ def find_agent(name: str, stored: Path | None = None) -> Registration:
     if ":" not in name:
         declared = entry_points(GROUP)
         if name not in declared:
-            near = difflib.get_close_matches(name.lower(), agent_names(), n=2, cutoff=0.5)
+            lower = {known.lower(): known for known in agent_names()}
+            near = [lower[one] for one in difflib.get_close_matches(name.lower(), lower, n=2, cutoff=0.5)]
             usual = "`delayrl agents` lists them; one of your own is MODULE:NAME, and a run is named by its folder"
             hint = f"did you mean {', '.join(near)}?" if near else usual
             raise DelayRLError(f"unknown agent {name!r}; {hint}")
@@ -119,22 +122,23 @@ def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = 
 
 
 def code_of(name: str, agent: Agent) -> str | None:
-    """Return a checksum of the modules that an agent's name, its classes and those of its parts are in.
+    """Return a checksum of the modules that an agent's name, its classes and those of its dataclasses are in.
 
     Of classes without a module's file, as in a notebook, it takes their functions. What those modules import is not in
-    it. None for agents of this package, and where no code can be read.
+    it, nor are bases in installed packages. None for agents of this package, and where no code can be read.
     """
     source = name if ":" in name else entry_points(GROUP).get(name, "")
     own: Any = agent.agent if isinstance(agent, NormalisedObservations) else agent
     parts = [own, *filter(is_dataclass, (getattr(own, field.name) for field in fields(own)))]
     classes = list(dict.fromkeys(kind for part in parts for kind in type(part).__mro__))
-    names = {source.partition(":")[0], *(kind.__module__ for kind in classes)} - {""}
+    named = {source.partition(":")[0], type(own).__module__}
     code = []
-    for module in sorted(names):
-        file = getattr(sys.modules.get(module), "__file__", None)
-        if module.partition(".")[0] in {"delayrl", *sys.stdlib_module_names}:
+    for module in sorted({*named, *(kind.__module__ for kind in classes)} - {""}):
+        file = getattr(sys.modules.get(module), "__file__", None) or ""
+        ours = module.partition(".")[0] in {"delayrl", *sys.stdlib_module_names}
+        if ours or (module not in named and file.startswith(INSTALLED)):
             continue
-        if file and Path(file).is_file():
+        if Path(file).is_file():
             code.append(Path(file).read_bytes())
         else:
             code += [_source(kind) for kind in classes if kind.__module__ == module]
@@ -142,11 +146,13 @@ def code_of(name: str, agent: Agent) -> str | None:
 
 
 def _source(kind: type) -> bytes:
-    """Return the source of a class's functions, as far as it can be read."""
+    """Return the source of a class's own functions, as far as it can be read."""
     text = ""
-    for function in filter(inspect.isfunction, vars(kind).values()):
-        with contextlib.suppress(OSError):  # generated, or typed where nothing keeps it
-            text += inspect.getsource(function)
+    for value in vars(kind).values():
+        function = inspect.unwrap(getattr(value, "__func__", None) or getattr(value, "fget", None) or value)
+        if inspect.isfunction(function) and function.__module__ == kind.__module__:
+            with contextlib.suppress(OSError):  # generated, or typed where nothing keeps it
+                text += inspect.getsource(function)
     return text.encode()
 
 
@@ -201,10 +207,16 @@ def _checked(thing: Any, name: str) -> Agent:
         if any(option.name == other.name and option.default != other.default for other in own):
             line = f"agent {name} has two options {option.name} with different values, and one name sets both"
             raise DelayRLError(f"{line}: give one another name, or leave out its Annotated")
-        if option.name in TAKEN or option.name in values_of(Schedule()):
+        if option.name in values_of(Schedule()):
             raise DelayRLError(f"agent {name} has an option {option.name}, as every run has: give it another name")
         option.check(option.default)
     return agent  # type: ignore[no-any-return]
+
+
+def check_not_taken(name: str, agent: Agent) -> None:
+    """Raise DelayRLError if an option is named like a parameter of `train`, which would take its value."""
+    if taken := sorted(TAKEN & {option.name for option in options(agent)}):
+        raise DelayRLError(f"{name} has an option {taken[0]}, and so has delayrl.train: give it another name")
 
 
 def _is_made_of(name: str, agent: Agent) -> bool:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 from delayrl.agents.base import Agent, Schedule
@@ -16,7 +16,7 @@ from delayrl.envs.making import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.lookup import contents
-from delayrl.run.agents import AgentLike, as_agent, as_trained, find_agent
+from delayrl.run.agents import AgentLike, as_agent, as_trained, check_not_taken, find_agent
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.rows import CONDITION
 
@@ -143,6 +143,7 @@ def resolve(
     if preset not in registration.presets:
         raise DelayRLError(f"unknown preset {preset!r} of {name}; there are {', '.join(registration.presets)}")
     base, chosen = registration.presets[preset], registration.protocol(protocol)
+    check_not_taken(name, base.agent)
     check_names(overrides, base.agent, base.schedule)
     values = {**chosen.overrides, **overrides}
     values = following(preset, base, override(base.schedule, values).steps) | values
@@ -156,7 +157,8 @@ def resolve(
         )
     condition = Condition(name, str(task), text, preset, protocol, dict(overrides), schedule.steps)
     made = as_trained(override(base.agent, values), schedule)
-    things = {"agent": (name, base.agent), "env": (str(task), task), "delay": (str(text), parsed)}
+    held = replace(task, wrappers=tuple(replace(part, found=None) for part in task.wrappers))  # these have names
+    things = {"agent": (name, base.agent), "env": (task.env.name, held), "delay": (str(text), parsed)}
     known = {option.name for option in options(base.agent)}  # are told apart by their values
     unnamed = {part: contents(thing, known) for part, (shown, thing) in things.items() if "<" in shown}
     return Setup(condition, task, made, schedule, parsed, chosen, {k: _digest(x) for k, x in unnamed.items() if x})

@@ -28,9 +28,9 @@ def seconds_of(env: Any) -> float | None:
         for seconds in (getattr(layer, "dt", None), getattr(layer, "tau", None) if layer is env.unwrapped else None):
             if isinstance(seconds, int | float | np.number) and seconds > 0:
                 return float(seconds) * steps
-            if seconds is not None:
-                shown = "a method" if callable(seconds) else repr(seconds)
-                warn_once(f"{name_of(env)}: its dt is {shown}, not seconds above 0, and is not used")
+        if (dt := getattr(layer, "dt", None)) is not None:
+            shown = "a method" if callable(dt) else f"{dt!r:.60}"
+            warn_once(f"{name_of(env)}: its dt is {shown}, not seconds above 0, and is not used")
     return None
 
 
