@@ -170,7 +170,7 @@ def _show_correlation(e: Estimated) -> list[str]:
         f"{'':<26}(that is the dead time, the plant's own lag, and a row)",
     ]
     if e.echoes:
-        lines.append(f"{', '.join(e.echoes)} {'repeats' if len(e.echoes) == 1 else 'repeat'} a command, and no sensor:")
+        lines.append(f"{', '.join(e.echoes)} {'repeats' if len(e.echoes) == 1 else 'repeat'} a command:")
         kept = e.peak.observation in e.echoes
         what = (
             "the answer may not be the plant's; name others" if kept else "left out; if it is a sensor, name it alone"
