@@ -150,6 +150,8 @@ def contents(thing: Any, skipped: Collection[str] = ()) -> Any:
         return contents(sorted((str(key), value) for key, value in thing.items() if value is not None))
     if isinstance(thing, str | int | float):
         return thing
-    name = name_of_object(thing) if callable(thing) else "<>"
-    private = any(part.startswith("_") for part in name.partition(":")[0].split("."))  # where a library may move it
-    return None if name.startswith("<") else name.partition(":")[2] if private else name
+    module, _, path = name_of_object(thing).partition(":") if callable(thing) else ("", "", "")
+    if not path:  # it cannot be imported by a name
+        return None
+    private = any(part.startswith("_") for part in module.split("."))  # where a library may move it
+    return path if private else f"{module}:{path}"

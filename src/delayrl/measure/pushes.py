@@ -80,7 +80,7 @@ def push(
 
 
 def repeating(echo: Array) -> Array:
-    """Return which components repeat actions, [C]: after several pushes, as an error that some pushes show alone does.
+    """Return which components repeat the actions of several pushes, [C], such as an error that is made from the action.
 
     A position that starts at 0 may be the first action by chance. If no component were left, none counts.
     """

@@ -10,11 +10,10 @@ import numpy as np
 
 from delayrl.envs.making import name_of
 from delayrl.errors import DelayRLError, described
+from delayrl.run.agents import INSTALLED
 
-LIBRARIES = tuple(
-    os.path.join(str(path), "")  # so that a folder whose name only begins alike is none of them
-    for path in (Path(__file__).parents[1], *map(sysconfig.get_path, ("stdlib", "purelib", "platlib")))
-)
+OURS, STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
+LIBRARIES = (*INSTALLED, os.path.join(OURS, ""), os.path.join(STANDARD, ""))
 """Where code lies that is not the user's."""
 
 

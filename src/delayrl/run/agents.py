@@ -9,6 +9,7 @@ import contextlib
 import difflib
 import hashlib
 import inspect
+import os
 import sys
 import sysconfig
 import warnings
@@ -26,9 +27,10 @@ from delayrl.run.configuration import OLDER, check_names, options, override, val
 from delayrl.run.folder import versions_in
 
 GROUP = "delayrl.agents"
-INSTALLED = tuple(map(sysconfig.get_path, ("purelib", "platlib")))
 AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
+INSTALLED = tuple(os.path.join(sysconfig.get_path(name), "") for name in ("purelib", "platlib"))
+"""Where installed packages lie, with a separator, so that a folder whose name only begins alike is none of them."""
 TAKEN = {
     *("agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device"),
     *("overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress"),
