@@ -5,9 +5,9 @@ which no plant can give; and without a delay. The first two also with actions sa
 benchmarks/results/forecast.jsonl.
 """
 
+import argparse
 import functools
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -87,8 +87,10 @@ def play(policy: Policy, env_name: str, delay: int, outputs: Outputs, *, sampled
 
 def main() -> None:
     """Play every run, and write a line for each way."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, nargs="+", help="a run folder")
     lines: list[dict[str, Any]] = [{"versions": versions(), "episodes": EPISODES}]
-    for path in map(Path, sys.argv[1:]):
+    for path in parser.parse_args().run:
         config, policy = delayrl.Run(path).config, delayrl.load(path)
         own = policy.spec.delay
         for way, (outputs, late, sampled) in WAYS.items():

@@ -1,8 +1,6 @@
 """The result on the first page: what each method is worth, from the cells of `evidence-1` and `-2` that have ended."""
 
-import contextlib
-import json
-import sqlite3
+import itertools
 from collections.abc import Collection
 from pathlib import Path
 
@@ -16,7 +14,6 @@ from delayrl.bench.results import read_table
 from delayrl.report.markdown import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.wording import interval, normalised
-from delayrl.run.cell import Cell
 from delayrl.run.condition import Condition
 
 Case = tuple[str, int]
@@ -54,7 +51,9 @@ def section(files: list[Path], pictures: Path) -> str:
     tables = [read_table(file) for file in files]
     chosen = choose(results_of(tables))
     draw(chosen, pictures / "result.png")
-    used = [versions for file in files for versions in trained_with(file)]
+    shown = [result.condition for result in chosen.values()]
+    runs = itertools.chain(*map(trained_with, files))
+    used = [versions for condition, _, own in runs if condition in shown for versions in own]
     *others, last = (f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
     steps = f"{', '.join(others)} and {last}"
     made = (
@@ -85,15 +84,11 @@ def comparable(results: list[Result], more: Collection[str] = ()) -> list[Result
 
 def older(files: list[Path]) -> set[tuple[str, Case]]:
     """Return the arms and cases with rows of `OLDER` commits, of agents that act under the delay alone."""
-    query = "SELECT cells.id, cells.cell, shared, versions FROM runs JOIN cells ON cells.id = runs.cell "
     found = set()
-    for file in files:
-        with contextlib.closing(sqlite3.connect(file)) as table:
-            for id, cell, shared, versions in table.execute(query + "WHERE state = 'done'"):
-                condition = Cell.from_json(json.loads(cell), id).condition
-                commits = {str(used.get("commit")).partition("-")[0] for used in json.loads(versions)}
-                if condition.delay and not json.loads(shared)["privileged"] and commits & OLDER:
-                    found.add((in_words(condition, False), (condition.env, condition.delay)))
+    for condition, privileged, versions in itertools.chain(*map(trained_with, files)):
+        commits = {str(used.get("commit")).partition("-")[0] for used in versions}
+        if condition.delay and not privileged and commits & OLDER:
+            found.add((in_words(condition, False), (condition.env, condition.delay)))
     return found
 
 

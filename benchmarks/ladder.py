@@ -65,7 +65,7 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
-    every = [used for file in files for used in trained_with(file)]
+    every = [used for file in files for *_, own in trained_with(file) for used in own]
     made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
     made += f"seeds, each of ten episodes. {made_on(every)} {rows_of(files, tables)}"
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
@@ -97,11 +97,15 @@ def rows_of(files: list[Path], tables: list[Collected]) -> str:
     return f"Rows, and cells that have ended: {', '.join(named)}."
 
 
-def trained_with(file: Path) -> list[dict[str, Any]]:
-    """Return the versions, commits and hardware of a table's cells that have ended."""
-    query = "SELECT versions FROM runs JOIN cells ON cells.id = runs.cell WHERE state = 'done' ORDER BY cells.number"
+def trained_with(file: Path) -> list[tuple[Condition, bool, list[dict[str, Any]]]]:
+    """Return the condition of each run whose cell has ended, whether it is privileged, and what it was trained with."""
+    query = "SELECT cells.id, cells.cell, shared, versions FROM runs JOIN cells ON cells.id = runs.cell "
+    found = []
     with contextlib.closing(sqlite3.connect(file)) as table:
-        return [used for (text,) in table.execute(query) for used in json.loads(text)]
+        for id, cell, shared, versions in table.execute(query + "WHERE state = 'done' ORDER BY cells.number"):
+            condition = Cell.from_json(json.loads(cell), id).condition
+            found.append((condition, bool(json.loads(shared).get("privileged")), json.loads(versions)))
+    return found
 
 
 def gflop(result: Result) -> str:

@@ -3,6 +3,7 @@
 The task is HalfCheetah-v5. Writes benchmarks/results/overhead.jsonl, from which figures.py makes the table.
 """
 
+import argparse
 import json
 import sys
 import time
@@ -35,6 +36,7 @@ def seconds(env: Any, steps: int) -> float:
 
 def main() -> None:
     """Measure every wrapper against the bare task, in alternation, and write the ratios."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     with quiet():
         cases: list[tuple[str, int, Any, Any]] = []
         bare = gym.make(TASK, disable_env_checker=True)

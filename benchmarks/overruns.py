@@ -3,6 +3,7 @@
 `hold` and `clip` are the controller's. `last` is what a buffer of fixed length does: it drops the oldest actions.
 """
 
+import argparse
 import json
 import sys
 from dataclasses import asdict
@@ -60,7 +61,11 @@ def returns(env: gym.Env[Any, Any], controller: Controller, link: Link) -> list[
 
 def main() -> None:
     """Play every link with every answer and write the returns."""
-    run, out = Path(sys.argv[1]), Path(sys.argv[2])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="a run folder")
+    parser.add_argument("out", type=Path, help="a file for the returns, one line for each link and answer")
+    given = parser.parse_args()
+    run, out = given.run, given.out
     config = json.loads((run / "config.json").read_text())
     policy = RunPolicy(run)
     env = gym.make(config["env"])

@@ -5,6 +5,7 @@ the significant bits of the format and adds in float32, as a GPU does. VDPO, pre
 Writes benchmarks/results/precision.jsonl.
 """
 
+import argparse
 import json
 import sys
 import time
@@ -72,6 +73,7 @@ def distance(x: Array, exact: Array) -> float:
 
 def main() -> int:
     """Compare each format with float32 on five seeds."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     lines, exact = [], [measure(23, seed) for seed in range(5)]
     for name, bits in MANTISSA.items():
         errors = [list(map(distance, measure(bits, seed), right)) for seed, right in enumerate(exact)]

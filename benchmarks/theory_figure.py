@@ -3,6 +3,7 @@
 Usage: python benchmarks/theory_figure.py [folder for the pictures]. Takes about ten minutes on one core.
 """
 
+import argparse
 import sys
 from itertools import product
 from pathlib import Path
@@ -433,7 +434,9 @@ def direction_numbers() -> None:
 
 
 def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "img"
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "docs" / "img", help="for the pictures")
+    folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     plt.rcParams.update(STYLE)
 
