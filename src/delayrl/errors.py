@@ -3,7 +3,7 @@
 import contextlib
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -24,8 +24,15 @@ class DelayWarning(UserWarning):
     """Something that works, but is probably not meant: one line."""
 
 
-TRAIN = ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL", "scipy")
-"""Modules that the extra `train` brings."""
+EXTRAS = {
+    "train": ("imageio", "jax", "jaxlib", "jaxtyping", "matplotlib", "mujoco", "optax", "PIL", "scipy"),
+    "deploy": ("onnx", "onnxruntime"),
+    "hub": ("huggingface_hub",),
+    "parquet": ("pyarrow",),
+    "brax": ("brax",),
+    "ray": ("ray",),
+}
+"""Modules that each extra brings."""
 
 
 def needs_extra(error: BaseException) -> DelayRLError | None:
@@ -33,7 +40,8 @@ def needs_extra(error: BaseException) -> DelayRLError | None:
     both = (error, error.__cause__)  # Gymnasium raises an error of its own from that of the import
     names = [one.name or "" for one in both if isinstance(one, ModuleNotFoundError)]
     module = "".join(names[:1]).partition(".")[0]
-    return DelayRLError(f"this needs {module}: pip install 'delayrl[train]'") if module in TRAIN else None
+    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+    return DelayRLError(f"this needs {module}: pip install 'delayrl[{extra}]'") if extra else None
 
 
 def import_later(package: str, homes: Mapping[str, str], name: str) -> Any:
@@ -74,6 +82,17 @@ def near_names(name: str, known: Iterable[str]) -> list[str]:
     if len(letters) > 1 and abbreviated:
         return abbreviated[:3]
     return difflib.get_close_matches(name, known, n=3, cutoff=0.6)
+
+
+def did_you_mean(near: Sequence[str], otherwise: str = "") -> str:
+    """Write the end of an error's message: the nearest names, or what to do where there are none."""
+    hint = f"did you mean {', '.join(near)}?" if near else otherwise
+    return f"; {hint}" if hint else ""
+
+
+def count(number: int, noun: str) -> str:
+    """Write a number of things, in the plural unless there is one."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def first_line(error: BaseException) -> str:

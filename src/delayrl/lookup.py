@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from delayrl.errors import DelayRLError, described, one_line
+from delayrl.errors import DelayRLError, described, did_you_mean, one_line
 
 
 def find_object(name: str) -> Any:
@@ -28,8 +28,7 @@ def find_object(name: str) -> Any:
     found = attribute(module, path)
     if found is None:
         near = difflib.get_close_matches(path, vars(module), n=3, cutoff=0.5)
-        hint = f"; did you mean {', '.join(near)}?" if near else ""
-        raise DelayRLError(f"module {source!r} has no {path!r}{hint}")
+        raise DelayRLError(f"module {source!r} has no {path!r}{did_you_mean(near)}")
     return found
 
 

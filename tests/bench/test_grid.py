@@ -247,6 +247,7 @@ BAD = [
     (BASIC.replace('["bpql", "a-sac"]', "[]"), "there are no agents, so nothing to run"),
     (BASIC.replace("[2, 3]", "[]"), "there are no delays"),
     (BASIC.replace("seeds = 2", "seeds = 0"), "there are no seeds"),
+    (BASIC.replace("seeds = 2", "seeds = 99999999999999999999"), "seeds must be from 1 to 10,000"),
     (BASIC.replace("seeds = 2", "seeds = [0, 2]"), "must be consecutive"),
     (BASIC.replace("seeds = 2", "seeds = true"), "must be a number or a list"),
     (BASIC.replace("[2, 3]", "[2.5]"), "whole environment steps"),

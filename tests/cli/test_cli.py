@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -306,6 +307,18 @@ def test_runs_tells_the_steps_of_one_without_evaluations(run: Path, tmp_path: Pa
     main(["runs", str(tmp_path), "--json"])
     (row,) = json.loads(capsys.readouterr().out)
     assert (row["step"], row["steps"], row["return"]) == (240, 240, None)
+
+
+def test_a_name_that_cannot_be_shown_is_escaped(run: Path, tmp_path: Path) -> None:
+    """Half of a surrogate pair in a file, or a terminal that knows ASCII alone: the table comes all the same."""
+    shutil.copytree(run, tmp_path / "run")
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config | {"preset": "\ud800\u00b1"}))
+    plain = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    words = [sys.executable, "-m", "delayrl", "runs", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, env=plain)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\\ud800\\xb1" in done.stdout
 
 
 def test_stopped_run_goes_on(tmp_path: Path) -> None:

@@ -413,6 +413,25 @@ def test_errors_name_the_last_line_of_the_users_code() -> None:
         stepping.step(env, np.zeros(1, np.float32))
 
 
+def test_an_environment_that_ends_the_process_is_told() -> None:
+    class Ending(Arm):
+        def step(self, action: Any) -> Any:
+            sys.exit(3)
+
+    env = make(lambda: TimeLimit(Ending(), 20), 0)
+    stepping.reset(env, 0)
+    with pytest.raises(DelayRLError, match=r"Ending failed in step: SystemExit: 3 \(test_task.py, line"):
+        stepping.step(env, np.zeros(1, np.float32))
+
+
+def test_a_task_without_actions_is_refused() -> None:
+    class Idle(Arm):
+        action_space = Box(-1, 1, (0,))
+
+    with pytest.raises(DelayRLError, match="there must be an action"):
+        make(lambda: TimeLimit(Idle(), 20), 0)
+
+
 def test_a_step_of_repeated_actions_is_longer_and_an_episode_of_them_shorter() -> None:
     env = gym.make("Pendulum-v1")  # 200 steps of 50 ms
     for repeats in (1, 3):

@@ -1,10 +1,14 @@
 """Pictures of runs: their names are text, not formulas."""
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from delayrl.errors import DelayRLError
 from delayrl.play import plots
 from delayrl.play.run import Run
 
@@ -23,3 +27,16 @@ def test_names_with_two_dollar_signs(tmp_path: Path) -> None:
     plots.against_delay([row | {"delay": 1, "returns": [1.0], "episodes": 1}], tmp_path / "delays.png")
     plots.curves([(name, np.ones(1), np.ones((2, 1)))], tmp_path / "curves.png", name)
     assert len(list(tmp_path.glob("*.png"))) == 3
+
+
+def test_a_full_disk_keeps_the_picture_that_was_there(tmp_path: Path, monkeypatch) -> None:
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    picture = tmp_path / "delays.png"
+    picture.write_bytes(b"older")
+    monkeypatch.setattr(os, "fsync", full)
+    row = {"agent": "sac", "env": "E", "seed": 0, "policy": "agent", "step": 1, "delay": 1, "returns": [1.0]}
+    with pytest.raises(DelayRLError, match=r"cannot write to .*delays.png: the disk is full"):
+        plots.against_delay([row | {"episodes": 1}], picture)
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("delays.png", b"older")]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from delayrl.errors import DelayRLError
+from delayrl.run.checkpoint import checkpoint_folders
 from delayrl.run.folder import RunFolder
 
 WEIGHTS = {"w": np.ones(3, np.float32)}
@@ -108,7 +109,15 @@ def test_a_schedule_without_steps_is_damaged(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("versions", "x"), ("later_versions", 1), ("later_versions", [1]), ("configuration", [1])]
+    ("name", "value"),
+    [
+        ("versions", "x"),
+        ("later_versions", 1),
+        ("later_versions", [1]),
+        ("configuration", [1]),
+        ("seed", "x"),
+        ("protocol", 0.5),
+    ],
 )
 def test_what_a_configuration_holds_besides_is_checked(name: str, value: object, run: RunFolder) -> None:
     (run.path / "config.json").write_text(json.dumps(run.config | {name: value}))
@@ -118,8 +127,45 @@ def test_what_a_configuration_holds_besides_is_checked(name: str, value: object,
 
 def test_a_line_that_is_no_object(run: RunFolder) -> None:
     (run.path / "metrics.jsonl").write_text("[1]\n")
-    with pytest.raises(DelayRLError, match=r"metrics.jsonl is damaged: a line is no object$"):
+    with pytest.raises(DelayRLError, match=r"metrics.jsonl is damaged: no object$"):
         run.read("metrics")
+
+
+@pytest.mark.parametrize("line", [{}, {"x": 1}, {"step": "x"}, {"step": None}])
+def test_a_line_without_a_step(line: dict, run: RunFolder) -> None:
+    """A run that goes on could not tell whether the line is of a later step."""
+    (run.path / "episodes.jsonl").write_text(json.dumps(line) + "\n")
+    with pytest.raises(DelayRLError, match=r"episodes.jsonl is damaged: a line has no step: \{"):
+        run.rewind(100)
+
+
+def test_an_episode_that_is_there_twice(run: RunFolder) -> None:
+    """Else its evaluation had most episodes, and all others seemed to be cut off by a crash."""
+    row = {"step": 100, "policy": "agent", "episode": 0, "reset_seed": 1, "return": 1.0, "length": 2}
+    run.append("rows", [row, row | {"episode": 1}, row | {"policy": "reference"}, row | {"step": 200}])
+    assert len(run.read("rows")) == 4
+    run.append("rows", [row])
+    with pytest.raises(DelayRLError, match=r"rows.jsonl holds an episode twice: step 100, agent$"):
+        run.read("rows")
+
+
+def test_what_is_no_checkpoint_or_piece_is_left_alone(run: RunFolder) -> None:
+    (run.path / "checkpoints" / "\u00b2").mkdir()
+    (run.path / "checkpoints" / "000000000700").write_text("a file")
+    (run.path / "replay" / "mine").mkdir(parents=True)
+    (run.path / "replay" / "notes.txt").write_text("mine")
+    piece = run.path / "replay" / "000000000000-000000000001.safetensors"
+    piece.write_bytes(b"old")
+    run.drop_pieces()
+    assert [path.name for path in checkpoint_folders(run.path)] == ["000000000100"]
+    assert sorted(path.name for path in (run.path / "replay").iterdir()) == ["mine", "notes.txt"]
+
+
+def test_a_pipe_is_no_run(tmp_path: Path) -> None:
+    """Reading it would wait for ever."""
+    os.mkfifo(tmp_path / "config.json")
+    with pytest.raises(DelayRLError, match="is not a run folder"):
+        print(RunFolder(tmp_path).config)
 
 
 def test_a_damaged_row_is_one_line(run: RunFolder) -> None:

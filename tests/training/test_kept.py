@@ -63,6 +63,20 @@ def test_a_seed_that_died_early_does_not_restart_a_finished_one(tmp_path: Path) 
     assert [run.rows()[-1]["step"] for run in train("random", tmp_path, seeds=2)] == [300, 300]
 
 
+def test_lost_rows_are_told(tmp_path: Path) -> None:
+    """A run that is complete, or goes on, would have a curve that begins late, or none."""
+    rows = train("random", tmp_path).path / "rows.jsonl"
+    whole = rows.read_text()
+    for kept in ("", "".join(line for line in whole.splitlines(keepends=True) if '"step": 100,' in line)):
+        rows.write_text(kept)
+        assert_refused(tmp_path, "checkpoint at step 300, and rows up to step", lambda: train("random", tmp_path))
+        assert_refused(tmp_path, "some are lost", lambda: delayrl.go_on(tmp_path, 600, progress=False))
+    rows.unlink()
+    assert_refused(tmp_path, "rows up to step 0 alone", lambda: train("random", tmp_path))
+    rows.write_text(whole)
+    assert train("random", tmp_path).rows()[-1]["step"] == 300
+
+
 def test_rows_without_a_checkpoint_are_not_begun_again(tmp_path: Path) -> None:
     """Somebody has deleted the checkpoints to save space."""
     run = train("random", tmp_path / "run")

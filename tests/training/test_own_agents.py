@@ -8,7 +8,7 @@ import types
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -18,6 +18,8 @@ from gymnasium.wrappers import TimeLimit
 import delayrl
 import own_agents
 from delayrl.agents.registry import AGENTS
+from delayrl.agents.sac import SAC
+from delayrl.agents.vdpo import VDPO
 from delayrl.bench.grid import load_grid
 from delayrl.cli.main import main
 from delayrl.core.types import Spec
@@ -111,6 +113,37 @@ def test_an_instance_and_presets_by_name(tmp_path: Path) -> None:
     usual, small = find_agent("own_agents:WIDE").presets["matched"], AGENTS["bpql"].presets["small"]
     assert usual == (own_agents.WIDE, AGENTS["bpql"].presets["matched"].schedule)
     assert find_agent("own_agents:WIDE").presets["small"].schedule == small.schedule
+
+
+@dataclass(frozen=True)
+class Wide(VDPO):
+    """VDPO with a field of its own, and another default."""
+
+    width: Annotated[int, "embedding dimension of the transformer"] = 512
+    extra: Annotated[float, "more"] = 0.5
+
+
+@dataclass(frozen=True)
+class Late(SAC):
+    """SAC that acts as BPQL's."""
+
+    actor_sees: str = "augmented"
+
+
+def test_a_class_that_derives_from_ours_has_its_presets() -> None:
+    """Its own fields keep their values, and an instance all of them."""
+    for preset in ("paper", "matched", "small"):
+        ours = AGENTS["vdpo"].presets[preset]
+        of_wide = as_agent(Wide).registration.presets[preset]
+        assert of_wide.schedule == ours.schedule
+        assert values_of(of_wide.agent) == values_of(ours.agent) | {"width": 512, "extra": 0.5}
+        assert as_agent(Wide()).registration.presets[preset].agent == Wide()
+        of_late = as_agent(Late).registration.presets[preset].agent
+        assert isinstance(of_late, Late)
+        assert values_of(of_late) == values_of(AGENTS["sac"].presets[preset].agent)
+        assert of_late.actor_sees == "augmented"
+        assert as_agent(VDPO).registration.presets[preset].agent == ours.agent
+    assert as_agent(Wide).registration.official == AGENTS["vdpo"].official
 
 
 def test_the_command_line_takes_a_preset_that_there_is(capsys) -> None:

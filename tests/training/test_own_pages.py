@@ -16,7 +16,7 @@ from delayrl.cli.main import main
 from delayrl.deploy import load_bundle
 from delayrl.play.run import Run
 from own_tasks import write_module
-from short_runs import declare, train
+from short_runs import OWN, declare, train
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -73,7 +73,7 @@ def test_an_installed_package(site: Path, capsys) -> None:
 def test_the_blocks(site: Path) -> None:
     """The agent has at most the 60 lines of its heading, and every block of Python that uses it runs."""
     module, *others = blocks((DOCS / "own-agent.md").read_text(), "python")
-    others = [block for block in others if "# smooth.py" not in block]  # that has a test of its own
+    others = [block for block in others if not re.match(r"# \w+\.py", block)]  # which have tests of their own
     assert len([line for line in module.splitlines() if line]) <= 60
     assert len(others) == 2
     laws = [block for block in blocks((DOCS / "delays.md").read_text(), "python") if "from my_laws" in block]
@@ -93,3 +93,16 @@ def test_the_agent_on_top_of_sac(tmp_path: Path, monkeypatch) -> None:
     runs = [train(agent, tmp_path / agent, preset="matched", steps=200, **values) for agent, values in ways.items()]
     returns = [[row["return"] for row in run.rows()] for run in runs]
     assert returns[0] == returns[2] != returns[1]
+
+
+@pytest.mark.thorough
+def test_the_agent_on_top_of_vdpo(tmp_path: Path, monkeypatch) -> None:
+    """It has VDPO's presets, and learns otherwise."""
+    page = (DOCS / "own-agent.md").read_text()
+    write_module(tmp_path, "both_ways", next(block for block in blocks(page, "python") if "# both_ways.py" in block))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    agents = ("vdpo", "both_ways:BothWays")
+    runs = [train(agent, tmp_path / agent, preset="matched", steps=200, **OWN["vdpo"]) for agent in agents]
+    assert runs[0].config["hyperparameters"] == runs[1].config["hyperparameters"]
+    assert runs[0].config["hyperparameters"]["dropout"] == 0
+    assert [row["return"] for row in runs[0].rows()] != [row["return"] for row in runs[1].rows()]

@@ -293,7 +293,8 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"seed": "0"}, "a seed must be a whole number from 0 to 2147483647; got '0'"),
         ({"seeds": [0, 1], "seed": 3}, "without seed="),
         ({"seeds": [0, -1]}, "a seed must be"),
-        ({"seeds": 0}, "seeds must be at least 1"),
+        ({"seeds": 0}, "seeds must be from 1 to 10,000; got 0"),
+        ({"seeds": 10**30}, "seeds must be from 1 to 10,000"),
         ({"device": "tpu"}, "cpu or gpu"),
         ({"replay_capacity": 5}, "at least"),
         (

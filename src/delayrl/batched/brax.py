@@ -10,13 +10,11 @@ import numpy as np
 from delayrl.batched.delay import BatchedLike, as_batched
 from delayrl.batched.episodes import Episode, act, arrive, restart, start
 from delayrl.batched.transit import Shown, augmented
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, one_line
 
-try:
+with one_line("brax cannot be imported"):
     from brax.envs.base import State, Wrapper
     from brax.envs.wrappers import training
-except ModuleNotFoundError as error:
-    raise DelayRLError("this needs brax: pip install 'delayrl[brax]'") from error
 
 NAME = "delay"
 """Where `state.info` keeps the messages on their way."""

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from delayrl.errors import DelayRLError
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
-from delayrl.run.disk import disk_errors, write_file
+from delayrl.run.disk import disk_errors, lock, parsed, write_file
 
 if TYPE_CHECKING:
     from delayrl.bench.grid import Grid
@@ -41,34 +41,21 @@ def hold_cell(folder: Path) -> Iterator[None]:
     Raises:
         LockedError: another process still holds it after a second; `holder` takes it for a moment.
     """
-    import fcntl  # POSIX only
-
-    with open(folder / "lock", "a+") as file:
-        give_up = time.monotonic() + 1
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > give_up:
-                    raise LockedError from None
-                time.sleep(0.05)
+    file = folder / "lock"
+    file.touch()
+    with lock(file, patience=1) as free:
+        if not free:
+            raise LockedError
         with contextlib.suppress(OSError):  # on a full disk the lock holds all the same
-            file.truncate(0)
-            file.write(f"{platform.node()} {os.getpid()}\n")
-            file.flush()
+            file.write_text(f"{platform.node()} {os.getpid()}\n")
         yield
 
 
 def holder(folder: Path) -> str | None:
     """Return the host and process id that hold the cell, or None."""
-    import fcntl
-
-    with contextlib.suppress(FileNotFoundError), open(folder / "lock") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return file.read().strip() or "another process"
+    file = folder / "lock"
+    with contextlib.suppress(FileNotFoundError), lock(file, shared=True) as free:
+        return None if free else file.read_text().strip() or "another process"
     return None
 
 
@@ -164,8 +151,6 @@ def _text(file: Path) -> str:
 
 def _loaded(text: str) -> dict[str, Any]:
     """Return the object that a text holds, empty if it holds none."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}
+    with contextlib.suppress(ValueError):
+        return parsed(text)
+    return {}

@@ -25,6 +25,7 @@ from delayrl.run.cell import Cell
 from delayrl.run.condition import Setup, resolve
 from delayrl.run.configuration import check_names, options
 from delayrl.training.checks import check_fit, replay_bytes
+from delayrl.training.seeds import MOST
 
 LISTS = {"agents": list, "tasks": list, "delays": list}
 TASK = {"env_kwargs": dict, "wrappers": list, "flatten": bool}
@@ -212,6 +213,8 @@ def _cells(table: dict[str, Any]) -> Iterator[Planned]:
 
 
 def _seed_groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int, ...]]:
+    if isinstance(seeds, int) and seeds > MOST:
+        raise DelayRLError(f"seeds must be from 1 to {MOST:,}; got {seeds}")
     numbers = list(range(seeds)) if isinstance(seeds, int) else seeds
     if not numbers:
         raise DelayRLError("there are no seeds, so nothing to run")

@@ -16,7 +16,7 @@ from urllib.parse import quote
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid
 from delayrl.bench.status import progress
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, count
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.cost import Cost
 from delayrl.run.disk import draft, lock
@@ -116,8 +116,7 @@ def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path,
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
         gone = sorted(id for id, of in known.items() if of.rows and id not in ids)
         if file == out and gone:
-            number = "1 cell" if len(gone) == 1 else f"{len(gone)} cells"
-            words = f"{out} has rows of {number} that {grid.name} has no more ({', '.join(gone[:3])}"
+            words = f"{out} has rows of {count(len(gone), 'cell')} that {grid.name} has no more ({', '.join(gone[:3])}"
             words += ", …)" if gone[3:] else ")"
             raise DelayRLError(f"{words}; give another --out, and --also {out} for the cells that it still has")
         held[file] = {id: known[id] for id in ids & known.keys()}
@@ -131,7 +130,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
     table.executescript("PRAGMA page_size = 4096; PRAGMA journal_mode = OFF;" + TABLES)
     meta = {"schema": str(SCHEMA), "grid": grid.name, "description": grid.description}
     table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-    count = 0
+    total = 0
     for number, cell in enumerate(grid.cells):
         p = progress(cell, runs)  # before the rows, which may be more
         paths = zip(folders.seed_paths(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
@@ -141,13 +140,13 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
         best = held[elsewhere].get(cell.id, Held()) if elsewhere else Held()
         begun = (runs / cell.folder).is_dir()
         if elsewhere and (best[:2] > here[:2] or (best > here and not begun)):
-            count += _copy_cell(table, elsewhere, cell, number)
+            total += _copy_cell(table, elsewhere, cell, number)
             continue
         _insert_cell(table, cell, number, p)
-        count += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)
+        total += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)
     table.commit()
     table.execute("VACUUM")
-    return count
+    return total
 
 
 def cells_done(file: Path) -> int:

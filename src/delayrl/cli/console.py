@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from delayrl.errors import DelayRLError, near_names
+from delayrl.errors import DelayRLError, did_you_mean, near_names
 
 
 class Parser(argparse.ArgumentParser):
@@ -31,9 +31,7 @@ class Parser(argparse.ArgumentParser):
         if rest:
             unknown = next((word for word in rest if word.startswith("--")), "").split("=")[0]
             options = [name for name in self._option_string_actions if name not in ("-h", "--help")]
-            near = near_names(unknown, options)
-            hint = f"; did you mean {', '.join(near)}?" if near else ""
-            self.error(f"unexpected {' '.join(rest)!r}{hint}")
+            self.error(f"unexpected {' '.join(rest)!r}{did_you_mean(near_names(unknown, options))}")
         return given
 
     def error(self, message: str) -> NoReturn:

@@ -1,5 +1,6 @@
 """The entry point of `delayrl`. An error that a user can cause is one line on stderr and a non-zero exit status."""
 
+import io
 import os
 import sys
 import warnings
@@ -32,6 +33,8 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that the words after `delayrl` name; None for the words of the process."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
+    if isinstance(sys.stdout, io.TextIOWrapper):  # what a terminal, or a name in a file, cannot show is escaped
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         _run(list(sys.argv[1:] if arguments is None else arguments))
     except DelayRLError as error:

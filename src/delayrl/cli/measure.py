@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from delayrl.cli.console import add_env_kwargs, add_wrappers, seconds, whole
 from delayrl.envs.task import as_task
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, count
 from delayrl.measure.log import Estimated, from_log
 from delayrl.measure.plot import plot
 from delayrl.measure.probing import Counts, Probed, probe
@@ -110,7 +110,7 @@ def _show_environment(p: Probed) -> str:
             )
             lines.append("from the action, such as an error or a command in other units, measure without them.")
     if p.maximum:
-        actions = _plural(p.maximum, "action")
+        actions = count(p.maximum, "action")
         lines += ["", f"An agent must remember {actions}. `delayrl train` does not see this delay:"]
         lines.append("remove it from the environment, and give it as --delay.")
     return "\n".join(lines)
@@ -120,8 +120,8 @@ def _counts(title: str, counts: Counts | None) -> list[str]:
     if counts is None:
         return [f"{title:<18} unknown"]
     if len(counts) == 1:
-        ((steps, count),) = counts.items()
-        return [f"{title:<18} {_plural(steps, 'step')}  ({count} times)"]
+        ((steps, times),) = counts.items()
+        return [f"{title:<18} {count(steps, 'step')}  ({times} times)"]
     total = sum(counts.values())
     mean = sum(steps * count for steps, count in counts.items()) / total
     head = f"{title:<18} {min(counts)} to {max(counts)} steps, mean {mean:.2f}, {total} times"
@@ -211,10 +211,6 @@ def _ranges(numbers: Iterable[int]) -> str:
         else:
             runs.append([number, number])
     return ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in runs)
-
-
-def _plural(count: int, word: str) -> str:
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
 def _refuse(given: argparse.Namespace, names: tuple[str, ...], of: str, target: str) -> None:

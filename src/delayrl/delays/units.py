@@ -2,7 +2,7 @@
 
 from delayrl.delays.channels import Delay
 from delayrl.delays.text import DelayLike, as_delay
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, count
 
 
 def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
@@ -17,15 +17,15 @@ def in_other_unit(given: DelayLike, delay: Delay, step_seconds: float) -> str:
         "80 steps = 3.2 s" for a delay in steps, "2 steps of 40 ms" for one in time; of a random delay the longest. If
         a time becomes more than a number of steps, the law comes first: "episode:2:3, up to 3 steps of 40 ms".
     """
-    count = "1 step" if delay.maximum == 1 else f"{delay.maximum} steps"
+    steps = count(delay.maximum, "step")
     if not (delay.observation.constant and delay.action.constant):
-        count = f"up to {count}"
+        steps = f"up to {steps}"
     try:
         as_delay(given)
     except DelayRLError:  # a time, which cannot be read without the length of a step
         law = "" if str(delay) == str(delay.maximum) else f"{delay.label()}, "
-        return f"{law}{count} of {_time(step_seconds)}"
-    return f"{count} = {_time(delay.maximum * step_seconds)}"
+        return f"{law}{steps} of {_time(step_seconds)}"
+    return f"{steps} = {_time(delay.maximum * step_seconds)}"
 
 
 def _time(seconds: float) -> str:

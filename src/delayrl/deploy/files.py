@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from delayrl.deploy.backends.network import Arrays, Network, parse
 from delayrl.errors import DelayRLError
-from delayrl.run.disk import disk_errors, write_flushed
+from delayrl.run.disk import disk_errors, parsed, write_flushed
 
 FORMAT = 1
 DOCUMENT, WEIGHTS, GRAPH = "bundle.json", "policy.safetensors", "policy.onnx"
@@ -152,11 +152,11 @@ def _parsed(data: bytes, file: Path) -> dict[str, Any]:
 def _is_bundle(file: Path) -> bool:
     """Whether it is the bundle.json of a bundle, in any format and even if damaged: such a bundle may be replaced."""
     try:
-        document = json.loads(_read(file))
-    except (ValueError, RecursionError, DelayRLError):
+        document = parsed(_read(file))
+    except (ValueError, DelayRLError):
         return False
     kinds = {"format": int, "policy": dict, "files": dict}
-    return isinstance(document, dict) and all(isinstance(document.get(name), kind) for name, kind in kinds.items())
+    return all(isinstance(document.get(name), kind) for name, kind in kinds.items())
 
 
 def _no_constant(text: str) -> None:

@@ -108,8 +108,6 @@ def plain(value: Any) -> str:
 
 
 def _hub() -> tuple[Any, Any]:
-    try:
+    with one_line("the hub cannot be reached"):
         import huggingface_hub
-    except ImportError as error:
-        raise DelayRLError("the hub needs the package huggingface_hub: pip install 'delayrl[hub]'") from error
     return huggingface_hub, huggingface_hub.HfApi()

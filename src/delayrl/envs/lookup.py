@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, did_you_mean
 from delayrl.lookup import attribute, find_module, is_unsafe
 
 
@@ -26,8 +26,7 @@ def find_id(name: str) -> str:
         return name
     near = difflib.get_close_matches(name, gym.registry, n=3, cutoff=0.5)
     usual = "`delayrl tasks` lists tasks; one of your own is MODULE:NAME, or MODULE:ID if the module registers it"
-    hint = f"did you mean {', '.join(near)}?" if near else usual
-    raise DelayRLError(f"unknown task {name!r}; {hint}")
+    raise DelayRLError(f"unknown task {name!r}{did_you_mean(near, usual)}")
 
 
 def find_maker(name: str) -> Any:
@@ -48,8 +47,8 @@ def find_maker(name: str) -> Any:
         return with_version(path)
     known = [name for name, value in vars(module).items() if callable(value)]
     near = difflib.get_close_matches(path, [*known, *gym.registry], n=3, cutoff=0.5)
-    hint = f"; did you mean {', '.join(near)}?" if near else ""
-    raise DelayRLError(f"module {source!r} has no class or function {path!r}, and registers no such task{hint}")
+    line = f"module {source!r} has no class or function {path!r}, and registers no such task"
+    raise DelayRLError(line + did_you_mean(near))
 
 
 def refuse_instance(thing: Any) -> None:
@@ -74,17 +73,23 @@ def find_stored(name: str, folder: Path) -> Any:
     if is_unsafe(name, folder):
         raise refusal
     found = find_maker(name)
-    if isinstance(found, str) or (isinstance(found, type) and issubclass(found, gym.Env)) or _is_own(found):
+    if (
+        isinstance(found, str)
+        or (isinstance(found, type) and issubclass(found, gym.Env))
+        or is_users(file_of(getattr(found, "__module__", None) or ""))
+    ):
         return found
     raise refusal
 
 
-def _is_own(thing: Any) -> bool:
-    """Return whether code is neither of Python itself nor in a folder of installed packages."""
-    module = sys.modules.get(getattr(thing, "__module__", None) or "")
-    file = getattr(module, "__file__", None)
-    if file is None:
-        return False
+def file_of(module: str) -> str:
+    """Return the file of an imported module; nothing where it has none, as in a notebook."""
+    return getattr(sys.modules.get(module), "__file__", None) or ""
+
+
+def is_users(file: str) -> bool:
+    """Return whether a file is neither Python's own, nor of this package, nor in a folder of installed packages."""
     path = Path(file).resolve()
-    python = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib")]
-    return not {"site-packages", "dist-packages"} & set(path.parts) and not any(map(path.is_relative_to, python))
+    others = [Path(__file__).parents[1], *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib"))]
+    installed = {"site-packages", "dist-packages"} & set(path.parts)
+    return bool(file) and not installed and not any(path.is_relative_to(other.resolve()) for other in others)

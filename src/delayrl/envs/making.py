@@ -12,7 +12,7 @@ from gymnasium.wrappers import NormalizeObservation, RescaleAction
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper
 from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task, closing
-from delayrl.errors import DelayRLError, near_names
+from delayrl.errors import DelayRLError, did_you_mean, near_names
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.layers import check_length
 from delayrl.wrappers.layers import check_limit as check_limit
@@ -80,7 +80,7 @@ def _made(task: Task, options: dict[str, Any]) -> Any:
         own = [p.name for p in inspect.signature(make).parameters.values() if p.kind is p.KEYWORD_ONLY]
         near = [ours for name in options for ours in near_names(name, own)]
         if near and isinstance(error.__cause__, TypeError):
-            raise DelayRLError(f"{error}; did you mean {', '.join(near)}?") from error.__cause__
+            raise DelayRLError(f"{error}{did_you_mean(near)}") from error.__cause__
         raise
 
 

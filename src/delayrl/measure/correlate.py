@@ -54,7 +54,7 @@ def echoes(commands: Array, observations: Array, episode: Array) -> Mask:
     Increments of smooth commands are like those of some rows later, so an echo is most like a command at once.
     """
     u, y = increments(commands, episode), increments(observations, episode)
-    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in range(2 * ORDER)])  # [lags, U, Y]
+    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in range(min(2 * ORDER, len(u)))])
     early = r[:2].max(0)
     return ((early > ECHO) & (early >= r.max(0))).any(0)
 

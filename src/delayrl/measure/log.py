@@ -4,7 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +163,8 @@ def from_log(
     for value, name, least in ((period, "period", 1e-9), (longest, "longest", 1e-9), (warm_up, "warm-up", 0)):
         if value is not None and not (isinstance(value, Real) and np.isfinite(value) and value >= least):
             raise DelayRLError(f"--{name} is a time in seconds; got {value}")
+    if not isinstance(seed, Integral) or seed < 0:
+        raise DelayRLError(f"--seed is a whole number from 0; got {seed!r}")
     table = reading.Table(path)
     exact = reading.read_stamps(table, stamp, received, episode, unit)
     if exact is not None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.errors import DelayRLError, first_line
+from delayrl.errors import DelayRLError, first_line, one_line
 from delayrl.measure.correlate import Array
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -47,29 +47,31 @@ def read_signals(
     CSV files need a header, and separate columns with commas, semicolons or tabs.
     """
     stamps = table.find(time, ("time", "timestamp", "t"), "time stamps", "--time", needed=True)
-    commands, observations = ([one] if isinstance(one, str) else one for one in (commands, observations))
-    groups = {}
+    both = {"commands": commands, "observations": observations}
+    given = {what: [one] if isinstance(one, str) else one or () for what, one in both.items()}
     others = [name for name in table.names if name != stamps]
-    words = {word.lower() for word in (*(commands or ()), *(observations or ()))}
-    named = words & {name.lower() for name in others}  # whole names, which are no prefixes of other columns
-    for what, given in (("commands", commands), ("observations", observations)):
-        starts = tuple(given or PREFIXES[what])
-        own = {word.lower() for word in given or ()} & named
-        prefixes = tuple(word.lower() for word in starts if word.lower() not in own)
-        names = [n for n in others if n.lower() in own or (n.lower() not in named and n.lower().startswith(prefixes))]
+    named = {word.lower() for own in given.values() for word in own} & {name.lower() for name in others}
+    groups = {what: _columns(others, own, PREFIXES[what], named) for what, own in given.items()}
+    for what, names in groups.items():
         if not names:
-            hint = f"none begins with {' or '.join(starts)}; name them with --{what}. It has {_few(table.names)}"
-            raise DelayRLError(f"{table.path} has no column for {what}: {hint}")
-        groups[what] = names
-    both = set(groups["commands"]) & set(groups["observations"])
-    if both:
-        line = f"{table.path}: {_few(sorted(both))} would be both a command and an observation"
+            hint = f"none begins with {' or '.join(given[what] or PREFIXES[what])}; name them with --{what}. It has "
+            raise DelayRLError(f"{table.path} has no column for {what}: {hint}{_few(table.names)}")
+    if twice := set(groups["commands"]) & set(groups["observations"]):
+        line = f"{table.path}: {_few(sorted(twice))} would be both a command and an observation"
         raise DelayRLError(f"{line}; use --commands")
     seconds, episodes = table.column(stamps) * UNITS[unit], table.recordings(episode)
     _check_times(table.path, stamps, seconds, episodes)
     us, u_names = table.join(groups["commands"])
     ys, y_names = table.join(groups["observations"])
     return Log(seconds - seconds[0], us, ys, episodes, u_names, y_names)
+
+
+def _columns(names: list[str], given: Sequence[str], usual: Sequence[str], whole: set[str]) -> list[str]:
+    """Return the columns that are named as `given`, or begin so; a `whole` name is no beginning of other columns."""
+    words = {word.lower() for word in given or usual}
+    own = {word.lower() for word in given} & whole
+    beginnings = tuple(words - own)
+    return [n for n in names if n.lower() in own or (n.lower() not in whole and n.lower().startswith(beginnings))]
 
 
 def read_stamps(
@@ -228,11 +230,9 @@ def _csv(path: Path) -> dict[str, list[str]]:
 
 
 def _parquet(path: Path) -> dict[str, Any]:
-    try:
+    with one_line(f"{path} is a Parquet file, which cannot be read here"):
         import pyarrow
         from pyarrow import parquet
-    except ImportError:
-        raise DelayRLError(f"{path} is a Parquet file: pip install 'delayrl[parquet]' to read it") from None
     try:
         table = parquet.read_table(path)
     except (pyarrow.ArrowException, OSError) as error:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delayrl.play.run import Run
+from delayrl.run.disk import write_figure
 from delayrl.run.rows import plain_text
 
 Line = tuple[str, NDArray[Any], NDArray[Any]]
@@ -65,4 +66,4 @@ def _axes(path: Path) -> Iterator[Any]:
     yield axes
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=130)
+    write_figure(path, figure, 130)

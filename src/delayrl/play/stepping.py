@@ -1,20 +1,14 @@
 """Reset and step environments whose code is the user's: what it raises becomes one line that says where."""
 
-import os
-import sysconfig
 import traceback
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from delayrl.envs.lookup import is_users
 from delayrl.envs.making import name_of
 from delayrl.errors import DelayRLError, described
-from delayrl.run.agents import INSTALLED
-
-OURS, STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
-LIBRARIES = (*INSTALLED, os.path.join(OURS, ""), os.path.join(STANDARD, ""))
-"""Where code lies that is not the user's."""
 
 
 def reset(env: Any, seed: int) -> tuple[Any, dict[str, Any]]:
@@ -23,7 +17,7 @@ def reset(env: Any, seed: int) -> tuple[Any, dict[str, Any]]:
         obs, info = env.reset(seed=seed)
     except DelayRLError:
         raise
-    except Exception as error:  # a try for each step costs nothing, a context manager would
+    except (Exception, SystemExit) as error:  # a try for each step costs nothing, a context manager would
         raise _one_line(env, "reset", error) from error
     _check_shape(env, info["truth"])
     return obs, info
@@ -35,7 +29,7 @@ def step(env: Any, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]
         obs, reward, terminated, truncated, info = env.step(action)
     except DelayRLError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise _one_line(env, "step", error) from error
     _check_shape(env, info["truth"])
     try:
@@ -51,8 +45,8 @@ def _check_shape(env: Any, truth: Any) -> None:
         raise DelayRLError(f"{name_of(env)} gave an observation of shape {np.shape(truth)}, but {declared}")
 
 
-def _one_line(env: Any, method: str, error: Exception) -> DelayRLError:
+def _one_line(env: Any, method: str, error: BaseException) -> DelayRLError:
     frames = traceback.extract_tb(error.__traceback__)
-    place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]
+    place = ([frame for frame in frames if is_users(frame.filename)] or frames)[-1]
     where = f"{Path(place.filename).name}, line {place.lineno}"
     return DelayRLError(f"{name_of(env)} failed in {method}: {described(error)} ({where})")

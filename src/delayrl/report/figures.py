@@ -12,6 +12,7 @@ import numpy as np
 from delayrl.report.results import Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
 from delayrl.report.summary import THRESHOLDS, Aggregate, Summary
+from delayrl.run.disk import write_figure
 from delayrl.run.rows import plain_text
 
 STYLES = {
@@ -106,7 +107,7 @@ def _save(figure: Any, path: Path) -> None:
     above = max(panel.get_title().count("\n") for panel in figure.axes) * figure.axes[0].get_gridspec().nrows
     figure.set_figheight(figure.get_figheight() + 0.17 * (below + above))  # lines beyond the usual ones
     figure.legend([lines[name] for name in names], drawn, fontsize=9, **look)
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure, 110)
 
 
 def _line(look: Look) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import html
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from delayrl.errors import count
 from delayrl.report import wording
 from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Result, Setting, agent_order
@@ -87,7 +88,7 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
                 line.append("")
                 continue
             interval = wording.interval((a.low, a.high), wording.normalised)
-            counts = GREY.format(f"{wording.tasks(a.tasks, delay)}, {wording.count(a.runs, 'run')}")
+            counts = GREY.format(f"{wording.tasks(a.tasks, delay)}, {count(a.runs, 'run')}")
             line.append("<br>".join(filter(None, (f"**{a.iqm:.2f}**", interval, counts))))
         body.append(line)
     return markdown_table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)

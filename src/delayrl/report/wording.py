@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from delayrl.errors import count
 from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Anchor, Result, Setting, agent_order
 from delayrl.report.statistics import FEWEST, SMOOTHED, mean_std
@@ -62,11 +63,6 @@ def interval(bounds: tuple[float, float], write: Callable[[float], str]) -> str:
     if math.isnan(low) or math.isinf(low):
         return ""
     return f"{write(low)} to {'×' if math.isinf(high) else write(high)}"
-
-
-def count(number: int, noun: str) -> str:
-    """Write a number of things, in the plural unless there is one."""
-    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 class EntryTexts(NamedTuple):

@@ -9,9 +9,7 @@ import contextlib
 import difflib
 import hashlib
 import inspect
-import os
 import sys
-import sysconfig
 import warnings
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -21,7 +19,8 @@ from typing import Any, NamedTuple
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.normalised import NormalisedObservations
 from delayrl.agents.registry import AGENTS, Registration, registered
-from delayrl.errors import DelayRLError, DelayWarning, one_line
+from delayrl.envs.lookup import file_of, is_users
+from delayrl.errors import DelayRLError, DelayWarning, did_you_mean, one_line
 from delayrl.lookup import entry_points, find_object, is_unsafe, name_of_object, public_name
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.folder import versions_in
@@ -29,8 +28,6 @@ from delayrl.run.folder import versions_in
 GROUP = "delayrl.agents"
 AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
-INSTALLED = tuple(os.path.join(sysconfig.get_path(name), "") for name in ("purelib", "platlib"))
-"""Where installed packages lie, with a separator, so that a folder whose name only begins alike is none of them."""
 TAKEN = {
     *("agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device"),
     *("overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress"),
@@ -60,7 +57,7 @@ def as_agent(agent: AgentLike) -> Named:
     name, made = name_of_object(kind), _checked(agent, kind.__name__)
     if not name.startswith("<") and not _is_made_of(name, made):
         name = f"<{kind.__name__}>"
-    return Named(public_name(name, GROUP), registered(_summary(made), made))
+    return Named(public_name(name, GROUP), _entry(agent, made))
 
 
 def find_agent(name: str, stored: Path | None = None) -> Registration:
@@ -84,8 +81,7 @@ def find_agent(name: str, stored: Path | None = None) -> Registration:
             lower = {known.lower(): known for known in agent_names()}
             near = [lower[one] for one in difflib.get_close_matches(name.lower(), lower, n=2, cutoff=0.5)]
             usual = "`delayrl agents` lists them; one of your own is MODULE:NAME, and a run is named by its folder"
-            hint = f"did you mean {', '.join(near)}?" if near else usual
-            raise DelayRLError(f"unknown agent {name!r}; {hint}")
+            raise DelayRLError(f"unknown agent {name!r}{did_you_mean(near, usual)}")
         source = declared[name]
     if stored is not None and is_unsafe(source, stored):
         what = f"an agent that could run any code, {source}"
@@ -97,8 +93,7 @@ def find_agent(name: str, stored: Path | None = None) -> Registration:
         for preset in found.presets.values():
             _checked(preset.agent, name)
         return found
-    made = _checked(found, name)
-    return registered(_summary(made), made)
+    return _entry(found, _checked(found, name))
 
 
 def agent_of(config: Mapping[str, Any], folder: Path, given: AgentLike | None = None) -> Agent:
@@ -136,9 +131,9 @@ def code_of(name: str, agent: Agent) -> str | None:
     named = {source.partition(":")[0], type(own).__module__}
     code = []
     for module in sorted({*named, *(kind.__module__ for kind in classes)} - {""}):
-        file = getattr(sys.modules.get(module), "__file__", None) or ""
+        file = file_of(module)
         ours = module.partition(".")[0] in {"delayrl", *sys.stdlib_module_names}
-        if ours or (module not in named and file.startswith(INSTALLED)):
+        if ours or (module not in named and file and not is_users(file)):
             continue
         if Path(file).is_file():
             code.append(Path(file).read_bytes())
@@ -219,6 +214,30 @@ def check_not_taken(name: str, agent: Agent) -> None:
     """Raise DelayRLError if an option is named like a parameter of `train`, which would take its value."""
     if taken := sorted(TAKEN & {option.name for option in options(agent)}):
         raise DelayRLError(f"{name} has an option {taken[0]}, and so has delayrl.train: give it another name")
+
+
+def _entry(given: Any, made: Agent) -> Registration:
+    """Return an entry for an own agent, whose presets differ in the schedule alone.
+
+    A class that derives from one of ours has that agent's presets and protocols, but for the fields that it declares.
+    """
+    for number, base in enumerate(given.__mro__ if isinstance(given, type) else ()):
+        if ours := _agent_with_defaults_of(base):
+            declared = {name for kind in given.__mro__[:number] for name in inspect.get_annotations(kind)}
+            presets = {}
+            for name, preset in ours.presets.items():
+                values = {field.name: getattr(preset.agent, field.name) for field in fields(base)}
+                with one_line(f"{given.__name__} cannot be made with the preset {name} of {base.__name__}"):
+                    agent = given(**{name: value for name, value in values.items() if name not in declared})
+                presets[name] = preset._replace(agent=agent)
+            return ours._replace(summary=_summary(made), paper="-", presets=presets)
+    return registered(_summary(made), made)
+
+
+def _agent_with_defaults_of(kind: type) -> Registration | None:
+    """Return the agent of ours whose preset `paper` is the class with its defaults: of SAC's, `sac`."""
+    papers = ((entry, entry.presets["paper"].agent) for entry in AGENTS.values())
+    return next((entry for entry, agent in papers if type(agent) is kind and agent == kind()), None)
 
 
 def _is_made_of(name: str, agent: Agent) -> bool:

@@ -5,12 +5,12 @@ checkpoint and of each piece of the replay that it needs.
 """
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from delayrl.errors import DelayRLError
 from delayrl.run.arrays import Arrays, load_arrays
+from delayrl.run.disk import parsed
 
 
 @dataclass(frozen=True)
@@ -43,14 +43,20 @@ class Checkpoint:
 
 
 def checkpoint_folders(run: Path) -> list[Path]:
-    """Return the folders of a run's checkpoints, newest first."""
-    return sorted((path for path in (run / "checkpoints").glob("*") if path.name.isdigit()), reverse=True)
+    """Return the folders of a run's checkpoints, newest first. Raises DelayRLError if they cannot be listed."""
+    folder = run / "checkpoints"
+    try:
+        found = list(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:  # which `glob` would hide
+        raise DelayRLError(f"{folder} cannot be read: {error.strerror}") from error
+    numbered = [path for path in found if path.name.isascii() and path.name.isdecimal() and path.is_dir()]
+    return sorted(numbered, reverse=True)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint's manifest. Raises DelayRLError if it is missing or damaged."""
     try:
-        manifest = json.loads((path / "manifest.json").read_text())
+        manifest = parsed((path / "manifest.json").read_text())
         step, complete = int(path.name), bool(manifest["complete"])
         files, pieces = dict(manifest["files"]), dict(manifest["pieces"])
         needed = {"agent.safetensors"} if complete else {"agent.safetensors", "loop.safetensors"}
@@ -58,7 +64,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             raise ValueError
     except OSError as error:
         raise DelayRLError(str(error)) from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise DelayRLError("its manifest is damaged") from error
     return Checkpoint(path, step, complete, files, pieces)
 

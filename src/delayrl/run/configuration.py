@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from delayrl.errors import DelayRLError, near_names
+from delayrl.errors import DelayRLError, did_you_mean, near_names
 
 OLDER: Mapping[str, Any] = {
     "entropy_unit": "scaled",
@@ -102,8 +102,8 @@ def check_names(values: Iterable[str], *configs: Any) -> None:
     for name in values:
         if name not in known:
             near = near_names(name, [*known, "start_from", "progress"])  # options of `train` alone
-            hint = f"did you mean {', '.join(near)}?" if near else "`delayrl train AGENT --help` lists them"
-            raise DelayRLError(f"unknown hyperparameter {name!r}; {hint}")
+            hint = did_you_mean(near, "`delayrl train AGENT --help` lists them")
+            raise DelayRLError(f"unknown hyperparameter {name!r}{hint}")
 
 
 def values_of(config: Any) -> dict[str, Any]:

@@ -2,10 +2,14 @@
 
 import contextlib
 import errno
+import io
+import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from delayrl.errors import DelayRLError
 
@@ -33,12 +37,31 @@ def write_file(path: Path, data: bytes, *, shared: bool = False) -> None:
         write_flushed(name, data)
 
 
+def write_figure(path: Path, figure: Any, dpi: int) -> None:
+    """Write a figure of Matplotlib as a .png, or as what the suffix says. What fails leaves the file that was there."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=dpi)
+    with disk_errors(path):
+        write_file(path, drawn.getvalue())
+
+
 def write_flushed(path: Path, data: bytes) -> None:
     """Write a file where it stands, flushed to the disk; for what is inside a draft already."""
     with open(path, "wb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def parsed(text: str | bytes) -> dict[str, Any]:
+    """Return the object that a JSON text holds. Raises ValueError where it holds none, or one nested too deeply."""
+    try:
+        value = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    if not isinstance(value, dict):
+        raise ValueError("no object")
+    return value
 
 
 def remove(path: Path) -> None:
@@ -50,22 +73,29 @@ def remove(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def lock(folder: Path) -> Iterator[bool]:
-    """Lock a folder until the block or the process ends; yield whether it was free (always where nothing can lock)."""
+def lock(path: Path, *, shared: bool = False, patience: float = 0) -> Iterator[bool]:
+    """Lock a file or folder until the block or the process ends; yield whether it was free (always if none can lock).
+
+    Shared locks keep out only those that are not. One that another process holds is tried again for `patience` seconds.
+    """
     try:
         import fcntl  # POSIX only
     except ImportError:
         yield True
         return
-    handle = os.open(folder, os.O_RDONLY)
+    handle = os.open(path, os.O_RDONLY if shared or path.is_dir() else os.O_RDWR)  # NFS locks what can be written
     try:
-        free = True
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            free = False
-        except OSError:  # a file system without locks
-            pass
+        free, give_up = False, time.monotonic() + patience
+        while not free:
+            try:
+                fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                free = True
+            except BlockingIOError:
+                if time.monotonic() >= give_up:
+                    break
+                time.sleep(0.05)
+            except OSError:  # a file system without locks
+                free = True
         yield free
     finally:
         os.close(handle)

@@ -23,17 +23,18 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, first_line
 from delayrl.run.arrays import Arrays, save_arrays
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
-from delayrl.run.disk import disk_errors, draft, lock, remove, write_file, write_flushed
-from delayrl.run.rows import check_row
+from delayrl.run.disk import disk_errors, draft, lock, parsed, remove, write_file, write_flushed
+from delayrl.run.rows import check_rows
 
 FORMAT = 1
 NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
 CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
 MORE: dict[str, Any] = {"versions": dict, "later_versions": list, "configuration": str, "origin": dict, "unnamed": dict}
+MORE |= {"seed": int, "protocol": str}
 """What it may hold besides."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")
@@ -51,7 +52,7 @@ class RunFolder:
     @property
     def exists(self) -> bool:
         """Whether a run has begun here."""
-        return (self.path / "config.json").exists()
+        return (self.path / "config.json").is_file()
 
     @property
     def is_free(self) -> bool:
@@ -66,11 +67,11 @@ class RunFolder:
         file = self.path / "config.json"
         self.check_exists()
         try:
-            config = json.loads(file.read_text())
-        except (ValueError, OSError, RecursionError) as error:
-            raise DelayRLError(f"{file} is damaged: {type(error).__name__}") from error
+            config = parsed(_text(file))
+        except ValueError as error:
+            raise DelayRLError(f"{file} is damaged: {first_line(error)}") from error
         _check_config(config, file)
-        return config  # type: ignore[no-any-return]
+        return config
 
     def check_exists(self) -> None:
         """Raise DelayRLError if no run has begun here. The message says what it is instead."""
@@ -106,13 +107,15 @@ class RunFolder:
         """Return the lines of one of the files LINES, without a last line that a crash cut off."""
         file = self.path / f"{name}.jsonl"
         try:
-            lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
-            rows = [json.loads(line) for line in lines if line.endswith("\n")]
-        except (ValueError, RecursionError) as error:
+            lines = _text(file).splitlines(keepends=True) if file.is_file() else []
+            rows = [parsed(line) for line in lines if line.endswith("\n")]
+        except ValueError as error:
             raise DelayRLError(f"{file} is damaged: {error}") from error
-        if name != "rows" and not all(isinstance(row, dict) for row in rows):
-            raise DelayRLError(f"{file} is damaged: a line is no object")
-        return [check_row(row, file) for row in rows] if name == "rows" else rows
+        if name == "rows":
+            return check_rows(rows, file)
+        if wrong := [row for row in rows if type(row.get("step")) is not int]:
+            raise DelayRLError(f"{file} is damaged: a line has no step: {str(wrong[0])[:200]}")
+        return rows
 
     def extend(self, config: Mapping[str, Any]) -> None:
         """Replace the configuration by one of a longer run, and its hash in all rows."""
@@ -130,7 +133,7 @@ class RunFolder:
                     write_file(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
             for later in checkpoint_folders(self.path):
                 if int(later.name) > step:
-                    _delete_checkpoint(later)
+                    shutil.rmtree(_set_aside(later))
 
     def checkpoints(self) -> tuple[list[Checkpoint], list[str]]:
         """Return the checkpoints from which training can resume, newest first, and one line for each broken one.
@@ -176,7 +179,7 @@ class RunFolder:
                 manifest = {"step": step, "complete": complete, "files": files, "pieces": pieces}
                 write_flushed(folder / "manifest.json", json.dumps(manifest).encode())
                 if final.exists():  # only now is there another for this step
-                    final.rename(_emptied(final.with_name(".gone")))
+                    _set_aside(final)
             shutil.rmtree(final.with_name(".gone"), ignore_errors=True)
         self._drop_checkpoints(2)
 
@@ -201,8 +204,8 @@ class RunFolder:
         for path in checkpoint_folders(self.path):
             with contextlib.suppress(DelayRLError):
                 needed |= read_checkpoint(path).pieces.keys()
-        for file in (self.path / "replay").glob("*"):
-            if file.name not in needed:
+        for file in (self.path / "replay").glob("*.safetensors*"):  # with drafts of a process that was killed
+            if file.name not in needed and file.is_file():
                 file.unlink(missing_ok=True)
 
     def _drop_checkpoints(self, kept: int) -> None:
@@ -253,6 +256,13 @@ def versions_in(config: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [used for used in (config.get("versions"), *config.get("later_versions", [])) if used]
 
 
+def _text(file: Path) -> str:
+    try:
+        return file.read_text()
+    except OSError as error:
+        raise DelayRLError(f"{file} cannot be read: {error.strerror}") from error
+
+
 def _check_config(config: Any, file: Path) -> None:
     for name, kind in CONFIG.items():
         if not isinstance(config, dict) or not isinstance(config.get(name), kind):
@@ -275,20 +285,14 @@ def check_more(config: Mapping[str, Any], where: object) -> None:
 def is_config(file: Path) -> bool:
     """Whether a file is the configuration of a run, of any version: damaged, it stands beside a run's rows."""
     try:
-        whole = CONFIG.keys() <= json.loads(file.read_text()).keys()
-    except (ValueError, OSError, AttributeError, RecursionError):
+        whole = file.is_file() and CONFIG.keys() <= parsed(file.read_text()).keys()
+    except (ValueError, OSError):
         whole = False
     return whole or (file.parent / "rows.jsonl").exists()
 
 
-def _delete_checkpoint(path: Path) -> None:
-    """Rename a checkpoint, then delete it: a crash leaves no half of it under its name."""
-    gone = _emptied(path.with_name(".gone"))
-    path.rename(gone)
-    shutil.rmtree(gone)
-
-
-def _emptied(path: Path) -> Path:
-    """Delete what a killed process left at a path; return the path."""
-    shutil.rmtree(path, ignore_errors=True)
-    return path
+def _set_aside(path: Path) -> Path:
+    """Rename a checkpoint that is to be deleted: a crash leaves no half of it under its name. Returns the new path."""
+    gone = path.with_name(".gone")
+    shutil.rmtree(gone, ignore_errors=True)  # of a killed process
+    return path.rename(gone)

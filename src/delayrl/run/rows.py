@@ -1,13 +1,13 @@
 """Rows: one for each evaluation episode, as a run folder's rows.jsonl holds them."""
 
 import math
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, count
 
 Row = dict[str, Any]
 CONDITION: dict[str, Any] = {"agent": str, "env": str, "delay": int | str, "preset": str, "protocol": str}
@@ -26,6 +26,16 @@ def check_row(row: Any, where: object) -> Row:
     return row
 
 
+def check_rows(rows: Iterable[Any], where: object) -> list[Row]:
+    """Return the rows of a run folder unchanged. Raises DelayRLError if one is damaged, or an episode there twice."""
+    known, whole = set(), [check_row(row, where) for row in rows]
+    for row in whole:
+        if (episode := (row["policy"], row["step"], row["episode"])) in known:
+            raise DelayRLError(f"{where} holds an episode twice: step {row['step']}, {row['policy']}")
+        known.add(episode)
+    return whole
+
+
 def whole_evaluations(episodes: Mapping[int, Sized]) -> list[int]:
     """Return the steps of a policy's evaluations, in order, but not of one that a crash cut: it has fewer episodes."""
     most = max(map(len, episodes.values()), default=0)
@@ -39,8 +49,7 @@ def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float | None:
 
 def return_in_words(returns: Sequence[float] | NDArray[np.float64]) -> str:
     """Write the mean of episodes' returns, ± their standard deviation, and of how many episodes it is."""
-    count, spread = np.size(returns), deviation(returns)
-    episodes = "1 episode" if count == 1 else f"{count} episodes"
+    spread, episodes = deviation(returns), count(np.size(returns), "episode")
     return f"{np.mean(returns):.1f}" + (f" ± {spread:.1f}" if spread is not None else "") + f" over {episodes}"
 
 

@@ -39,14 +39,13 @@ def source_of(run: RunFolder, begun: list[RunFolder]) -> tuple[dict[str, Any], C
         hint = f"`delayrl train {where} --steps {begun[0].config['schedule']['steps']}`"
         raise DelayRLError(f"{error}; what has begun in {where} goes on without it: {hint}") from error
     names = ("agent", "env", "delay", "seed", "configuration")
-    described = {name: config[name] for name in names if name in config}
-    described |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}
-    stored = begun[0].config.get("origin", {}).get("from", {}) if begun and begun[0].checkpoints()[0] else {}
+    now = {name: config[name] for name in names if name in config}
+    now |= {"step": checkpoint.step, "networks": checkpoint.files["agent.safetensors"]}
+    then = begun[0].config.get("origin", {}).get("from", {}) if begun and begun[0].checkpoints()[0] else {}
     longer = "lengths" in config.get("origin", {})  # `go_on` has changed its configuration
-    decisive = names[:-1] if longer else names
-    known = bool(stored) and all(stored.get(name) == described.get(name) for name in decisive)
-    other = known and stored["step"] == described["step"] and stored["networks"] != described["networks"]
-    return stored if known and not other else described, checkpoint
+    same_run = bool(then) and all(then.get(name) == now.get(name) for name in (names[:-1] if longer else names))
+    retrained = same_run and then["step"] == now["step"] and then["networks"] != now["networks"]
+    return then if same_run and not retrained else now, checkpoint
 
 
 def taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) -> State:

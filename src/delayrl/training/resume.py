@@ -1,6 +1,6 @@
 """Starting, saving and resuming: run folders on one side, a `TrainState` on the other."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -102,6 +102,11 @@ def _go_on(
 ) -> None:
     """Bring the run folders to their checkpoints, and write down how they go on, with which versions."""
     runs, newest = group.folders, checkpoints[0]
+    for run in runs:
+        last = max((row["step"] for row in run.read("rows") if row["step"] <= newest.step), default=0)
+        if last <= newest.step - group.setup.schedule.evaluate_every:
+            line = f"{run.path} has a checkpoint at step {newest.step:,}, and rows up to step {last:,} alone"
+            raise DelayRLError(f"{line}: some are lost; --overwrite starts afresh")
     complete = newest.step >= group.setup.schedule.steps
     note(f"{'already complete' if complete else 'resumed'} at step {newest.step:,}: {runs[0].path}")
     warn_of_other_code(runs[0].config, runs[0].path, group.setup.agent)
@@ -140,23 +145,29 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
         note(line)
     common = set.intersection(*({checkpoint.step for checkpoint in own} for own in good))
     if common:
-        return [next(checkpoint for checkpoint in own if checkpoint.step == max(common)) for own in good]
-    for run, lines in zip(runs, broken, strict=True):
+        return [next(one for one in own if one.step == max(common)) for own in good]
+    _check_may_begin(group, [own[0].step if own else 0 for own in good], broken)
+    return []
+
+
+def _check_may_begin(group: Group, steps: list[int], broken: Sequence[list[str]]) -> None:
+    """Raise DelayRLError unless seeds without a common checkpoint may begin anew; `steps` are those of their newest."""
+    runs, first, total = group.folders, group.setup.schedule.evaluate_every, group.setup.schedule.steps
+    for run, lines, step in zip(runs, broken, steps, strict=True):
         if lines:
             raise DelayRLError(f"{run.path} has no good checkpoint left; --overwrite starts afresh")
-    first = group.setup.schedule.evaluate_every
-    steps = [own[0].step if own else 0 for own in good]
-    for run, step in zip(runs, steps, strict=True):
         if not step and (last := max((row["step"] for row in run.read("rows")), default=0)) > first:
             raise DelayRLError(f"{run.path} has rows up to step {last:,} and no checkpoint; --overwrite starts afresh")
-    crashed = all(run.exists for run in runs) and max(steps) <= first  # between the seeds' first checkpoints
-    if any(good) and (group.further or not crashed or len({*steps} - {0}) > 1):
-        at = ", ".join(f"{run.path} at {step:,}" for run, step in zip(runs, steps, strict=True))
-        words = "delayrl train {} --steps {}" if group.further else "--out {} --seed {}"
-        numbers = [group.setup.schedule.steps] * len(runs) if group.further else group.seeds
-        alone = ", ".join(words.format(run.path, number) for run, number in zip(runs, numbers, strict=True))
-        raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({alone})")
-    return []
+    stored = {*steps} - {0}
+    # a crash between the seeds' first checkpoints leaves some with that one, and others with none
+    crashed = all(run.exists for run in runs) and max(steps) <= first and len(stored) == 1
+    if not stored or (crashed and not group.further):
+        return
+    at = ", ".join(f"{run.path} at {step:,}" for run, step in zip(runs, steps, strict=True))
+    further = [f"delayrl train {run.path} --steps {total}" for run in runs]
+    alone = [f"--out {run.path} --seed {seed}" for run, seed in zip(runs, group.seeds, strict=True)]
+    ways = ", ".join(further if group.further else alone)
+    raise DelayRLError(f"the seeds stand at different steps ({at}); train each alone ({ways})")
 
 
 def _is_bare(run: RunFolder) -> bool:

@@ -12,13 +12,16 @@ from delayrl.play.evaluation import check_seed
 from delayrl.run.condition import Condition
 from delayrl.run.folder import RunFolder
 
+MOST = 10_000
+"""Seeds that one call may train: they are trained in lockstep."""
+
 
 def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
     """Return the seeds to train: `seeds` many from `seed` on, or those listed. Raises DelayRLError for bad ones."""
     check_seed(seed)
     if isinstance(seeds, int | np.integer):
-        if seeds < 1:
-            raise DelayRLError(f"seeds must be at least 1; got {seeds}")
+        if not 1 <= seeds <= MOST:
+            raise DelayRLError(f"seeds must be from 1 to {MOST:,}; got {seeds}")
         numbers: list[Any] = list(range(seed, seed + seeds))
     else:
         numbers = list(seeds) if isinstance(seeds, Sequence) else []

@@ -62,6 +62,8 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
         raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}{hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
         raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
+    if not actions.shape[0]:
+        raise DelayRLError(f"{name}: there must be an action; got {actions}")
     if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
         raise DelayRLError(f"{name}: actions must be bounded, with low < high; got {actions}")
 

@@ -16,7 +16,7 @@ from typing import Any
 from delayrl.bench.backends.local import read_outcome, start_worker
 from delayrl.bench.runner import PAUSE
 from delayrl.bench.worker import Outcome
-from delayrl.errors import DelayRLError, described, first_line
+from delayrl.errors import DelayRLError, described, first_line, one_line
 from delayrl.run.cell import Cell
 
 TIMEOUT = 5.0
@@ -116,10 +116,8 @@ class RayBackend:
 
 def connect(address: str | None) -> Any:
     """Return `ray`, connected to a cluster or a new local one. Raises DelayRLError if it is missing or none answers."""
-    try:
+    with one_line("the backend ray cannot be imported"):
         import ray
-    except ImportError as error:
-        raise DelayRLError("--backend ray needs `pip install 'delayrl[ray]'`") from error
     quiet = {"log_to_driver": False, "logging_level": "error", "ignore_reinit_error": True}
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     if address is None:

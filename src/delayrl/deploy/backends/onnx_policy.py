@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delayrl.deploy.backends.network import Act, Arrays, Network
 from delayrl.deploy.backends.numpy_policy import Encoder, Layer, fold, layer_norms, layers
-from delayrl.errors import DelayRLError
+from delayrl.errors import one_line
 
 OPSET, IR = 17, 8
 
@@ -60,11 +60,9 @@ class Graph:
 
 def onnx_graph(network: Network, arrays: Arrays, metadata: Mapping[str, Any]) -> bytes:
     """Return the serialised model. Raises DelayRLError if the package `onnx` is not installed."""
-    try:
+    with one_line("the graph cannot be made"):
         import onnx
         from onnx import TensorProto, helper
-    except ImportError as error:
-        raise DelayRLError("exporting a policy needs the package onnx: pip install 'delayrl[deploy]'") from error
     graph = Graph()
     low, high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
     delayed = graph("Greater", "age", graph.constant(0, np.int64))
@@ -108,12 +106,8 @@ def onnx_policy(network: Network, arrays: Arrays) -> Act:
     A file with a graph is never run. It could hang, fill the memory, or act otherwise on inputs that no check has met.
     Raises DelayRLError if onnx or onnxruntime is not installed.
     """
-    try:
-        import onnx  # noqa: F401
+    with one_line("the backend onnx cannot be imported"):
         import onnxruntime
-    except ImportError as error:
-        line = "the backend onnx needs the packages onnx and onnxruntime: pip install 'delayrl[deploy]'"
-        raise DelayRLError(line) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
