@@ -215,9 +215,12 @@ def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     return [RunFolder(path).config for path in paths if (path / "config.json").exists()]
 
 
-def read_table(file: Path) -> Collected:
-    """Read a collected table. Raises DelayRLError if it is none of ours, damaged, or has another schema version."""
-    with _open(file) as table:
+def read_table(file: str | Path) -> Collected:
+    """Return the rows, the cells with their progress, the configurations and the description of a collected table.
+
+    Raises DelayRLError if it is none of ours, damaged, or has another schema version.
+    """
+    with _open(Path(file)) as table:
         return _read(table)
 
 

@@ -23,7 +23,15 @@ RARE = 1e-3
 
 @dataclass(frozen=True)
 class Channel:
-    """A law of travel times, and the rule that says which message counts when several are on their way."""
+    """A law of travel times, and the rule that says which message counts when several are on their way.
+
+    Args:
+        law: of `delayrl.delays` or your own; a number is a constant delay in steps.
+        rule: "newest", "fifo", "raw" or "wait", as docs/delays.md describes them.
+
+    Raises:
+        DelayRLError: a text, a delay that is no whole number of steps from 0 on, another rule.
+    """
 
     law: DelayLaw = NO_DELAY
     rule: Rule = "newest"
@@ -72,7 +80,16 @@ CHANNELS = ("observation", "action", "reward")
 
 @dataclass(frozen=True)
 class Delay:
-    """The delays of observations, of actions, and of rewards together with terminations."""
+    """The delays of observations, of actions, and of rewards together with terminations, in environment steps.
+
+    Args:
+        observation: a `Channel`, or the law or number of one.
+        action: as `observation`.
+        reward: as `observation`.
+
+    Raises:
+        DelayRLError: as `Channel`, or rewards under the rule `raw`.
+    """
 
     observation: Channel = Channel()
     action: Channel = Channel()

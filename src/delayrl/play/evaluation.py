@@ -202,7 +202,19 @@ def sweep(
 ) -> Iterator[dict[str, Any]]:
     """Evaluate a run, or a policy, at every constant delay from 0 to the longest age that its policy was trained for.
 
-    Yields what `evaluate` returns, and `learned`: whether the policy learned that age, after the start of an episode.
+    Args:
+        run: as `evaluate`.
+        episodes: as `evaluate`, at each delay.
+        seed: as `evaluate`.
+        env: as `evaluate`.
+        env_kwargs: as `evaluate`.
+        agent: as `evaluate`.
+
+    Yields:
+        What `evaluate` returns, and `learned`: whether the policy learned that age, after the start of an episode.
+
+    Raises:
+        DelayRLError: as `evaluate`.
     """
     policy, task = _loaded(run, env, env_kwargs, agent)
     for delay in range(policy.spec.delay + 1):

@@ -68,7 +68,7 @@ class Run:
         return self._read("rows")
 
     def metrics(self) -> list[dict[str, Any]]:
-        """Return losses and speed, a row for every 1,000 steps."""
+        """Return losses and speed, a row for every 1,000 steps: none of a shorter run."""
         return self._read("metrics")
 
     def episodes(self) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from delayrl.run.cell import Standing
 def report(
     rows: Iterable[Mapping[str, Any]],
     standing: Standing,
-    out: Path,
+    out: str | Path,
     title: str = "delayrl",
     configs: Iterable[Mapping[str, Any]] = (),
     description: str = "",
@@ -33,7 +33,7 @@ def report(
     Raises:
         DelayRLError: damaged or double rows, nothing to show, a folder that cannot be written.
     """
-    summary = summarise(rows, standing, configs)
+    out, summary = Path(out), summarise(rows, standing, configs)
     if not summary.results:
         raise DelayRLError("there is nothing to report: no cells and no rows")
     try:

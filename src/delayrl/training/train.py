@@ -48,7 +48,7 @@ def train(
     delay: DelayLike = 0,
     *,
     env_kwargs: Mapping[str, Any] | None = None,
-    wrappers: Sequence[WrapperLike] = (),
+    wrappers: WrapperLike | Sequence[WrapperLike] = (),
     flatten: bool = False,
     preset: str = "paper",
     seed: int = 0,

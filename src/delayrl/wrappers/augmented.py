@@ -104,7 +104,16 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
 
 
 class AugmentedVectorObservation(VectorWrapper[Any, Any, Any, Any, Any]):
-    """Show the augmented states of N environments wrapped by `DelayedVector`, [N, S + H·A + 1]."""
+    """Show the augmented states of N environments wrapped by `DelayedVector`, [N, S + H·A + 1].
+
+    A row is laid out as `AugmentedObservation` does it. `final_obs` in the infos holds augmented states too.
+
+    Args:
+        env: the `DelayedVector`.
+
+    Raises:
+        DelayRLError: it is another environment.
+    """
 
     def __init__(self, env: DelayedVector) -> None:
         if not isinstance(env, DelayedVector):

@@ -56,15 +56,39 @@ class OverrunError(DelayRLError):
     """The newest observation is older than any that the policy was trained for (`on_overrun="raise"`)."""
 
 
-class ControlPolicy(Protocol):
-    """A policy that a controller can run: a function with its sizes and ranges."""
+NEEDED = ("obs_size", "action_size", "low", "high", "max_age")
+"""What a policy must say of itself. Without `dt` its steps are of unknown length."""
 
-    obs_size: int  # S
-    action_size: int  # A
-    low: NDArray[Any]  # [A], the least action in range
-    high: NDArray[Any]  # [A], the largest
-    max_age: int  # Δ, the longest age that it accepts, in steps
-    dt: float | None  # seconds a step; None if unknown
+
+class ControlPolicy(Protocol):
+    """A policy that a controller can run: a function with its sizes and ranges, as attributes or properties.
+
+    It may have `action_delay` and `min_age` besides, in steps: the defaults of the Controller's arguments.
+    """
+
+    @property
+    def obs_size(self) -> int:
+        """Return S."""
+
+    @property
+    def action_size(self) -> int:
+        """Return A."""
+
+    @property
+    def low(self) -> NDArray[Any]:
+        """Return the least action in range, [A]."""
+
+    @property
+    def high(self) -> NDArray[Any]:
+        """Return the largest action in range, [A]."""
+
+    @property
+    def max_age(self) -> int:
+        """Return Δ, the longest age that it accepts, in steps."""
+
+    @property
+    def dt(self) -> float | None:
+        """Return the seconds of a step; None if unknown."""
 
     def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
         """Return the action [A] for an observation [S] of this age and the actions [Δ, A] since.
@@ -279,8 +303,9 @@ def _decide(policy: ControlPolicy, obs: NDArray[Any], actions: Sequence[Action],
 
 def _check(policy: ControlPolicy) -> None:
     """Raise DelayRLError if a policy does not say of itself what a `ControlPolicy` does."""
-    if missing := [name for name in ControlPolicy.__annotations__ if name != "dt" and not hasattr(policy, name)]:
-        raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}")
+    if missing := [name for name in NEEDED if not hasattr(policy, name)]:
+        hint = "; export it, and give what `load_bundle` returns" if hasattr(policy, "spec") else ""
+        raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}{hint}")
     if not isinstance(policy.max_age, int | np.integer) or policy.max_age < 0:
         raise DelayRLError(f"the policy's max_age is a whole number of steps, 0 or more; got {policy.max_age!r:.80}")
     low, high = _numbers(policy.low, np.float64), _numbers(policy.high, np.float64)
