@@ -30,7 +30,7 @@ def test_nothing_to_report(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(DelayRLError, match="cannot be written"):
+    with pytest.raises(DelayRLError, match="cannot write to "):
         report([], list(small().values()), tmp_path / "file")
 
 

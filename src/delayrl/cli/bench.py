@@ -10,7 +10,7 @@ from typing import Any
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
 from delayrl.bench.status import HEAD, closing_lines, duration, line, progress, standing, table
-from delayrl.cli.console import StatusLine, print_table, whole
+from delayrl.cli.console import StatusLine, positive, print_table
 from delayrl.errors import STOPPED, DelayRLError
 from delayrl.run.cell import Cell
 from delayrl.training.signals import stop_signal
@@ -41,9 +41,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add = run.add_argument
     add("--cells", nargs="+", metavar="ID", help="only these cells")
     add("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
-    add("--workers", type=whole, metavar="N", help="cells at a time (default: one a core, or one with a GPU)")
+    add("--workers", type=positive, metavar="N", help="cells at a time (default: one a core, or one with a GPU)")
     add("--time-limit", type=time_limit, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")
-    add("--tries", type=whole, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)")
+    add(
+        "--tries", type=positive, default=5, metavar="N", help="deaths of a cell in a row with nothing new (default: 5)"
+    )
     add("--device", choices=["cpu", "gpu"], help="(default: JAX's choice)")
     add("--sbatch", action="append", metavar="OPTION", help="slurm: e.g. --sbatch=--partition=gpu")
     add("--submit", action="store_true", help="slurm: pass the script to sbatch as well")
@@ -51,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--cpus", type=float, help="ray: cores for each cell (default: 1)")
     add("--gpus", type=float, help="ray: GPUs for each cell (default: 0)")
     add = add_command("status", "show progress, speed, time left and failures").add_argument
-    add("--workers", type=whole, default=1, metavar="N", help="cells at a time, for the time left (default: 1)")
+    add("--workers", type=positive, default=1, metavar="N", help="cells at a time, for the time left (default: 1)")
     add = add_command("collect", "write the rows of a grid into one SQLite table").add_argument
     add("--out", type=Path, help="the table (default: GRID.sqlite in the folder of the cells)")
     words = "also take cells from this table: of another machine, or of a grid that shares them"
@@ -73,13 +75,10 @@ def run(given: argparse.Namespace) -> None:
 
 def _is_table(grid: str) -> bool:
     """Tell whether the argument is a table. `collect --out` gives it any name, so its first bytes count."""
-    if grid in shipped():
-        return False
-    try:
-        with open(grid, "rb") as file:
-            return file.read(len(SQLITE)) == SQLITE or grid.endswith(".sqlite")
-    except OSError:
+    if grid in shipped() or not Path(grid).is_file():
         return grid.endswith(".sqlite")  # reading it says what is wrong
+    with open(grid, "rb") as file:
+        return file.read(len(SQLITE)) == SQLITE or grid.endswith(".sqlite")
 
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:
@@ -99,7 +98,6 @@ def _plan(grid: Grid, given: argparse.Namespace) -> None:
 
 
 def _status(grid: Grid, given: argparse.Namespace) -> None:
-    _check_at_least_one("--workers", given.workers)
     cells = standing(grid.cells, given.runs)
     print_table(HEAD, table(cells))
     print("", *closing_lines(grid.name, cells, given.workers), sep="\n")
@@ -136,8 +134,6 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
 
     _check_backend(given)
     cells = _chosen(grid, given.cells)
-    _check_at_least_one("--tries", given.tries)
-    _check_at_least_one("--workers", given.workers)
     folders.claim(given.runs, grid)
     if given.backend == "slurm":
         _write_slurm(grid, cells, given)
@@ -218,11 +214,6 @@ def _check_backend(given: argparse.Namespace) -> None:
         for name, default in options.items():
             if given.backend != backend and getattr(given, name) != default:
                 raise DelayRLError(f"--{name} needs --backend {backend}; got --backend {given.backend}")
-
-
-def _check_at_least_one(name: str, value: int | None) -> None:
-    if value is not None and value < 1:
-        raise DelayRLError(f"{name} must be at least 1; got {value}")
 
 
 def time_limit(text: str) -> float:

@@ -95,6 +95,13 @@ def whole(text: str) -> int:
     raise argparse.ArgumentTypeError(f"must be a whole number; got {text!r}")
 
 
+def positive(text: str) -> int:
+    """Read a whole number that is at least 1."""
+    if (number := whole(text)) < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1; got {text}")
+    return number
+
+
 def seconds(text: str) -> float:
     """Read a time such as 20ms, 0.02s or 50Hz."""
     from delayrl.measure.reading import UNITS

@@ -25,7 +25,7 @@ from delayrl.play.picture import Picture, aim, beside, caption, close, render
 from delayrl.play.policy import Policy, load
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
-from delayrl.run.disk import draft
+from delayrl.run.disk import disk_errors, draft
 from delayrl.run.folder import RunLike, path_of
 
 FASTEST = {".mp4": 60, ".gif": 15}
@@ -199,20 +199,17 @@ def _video(out: Path, rate: float) -> Iterator[Callable[[Any], None]]:
 
     What fails leaves the file that was there.
     """
-    try:
-        with draft(out) as name, name.open("wb") as file:
-            if out.suffix == ".gif":
-                frames: list[Image.Image] = []
-                yield lambda picture: frames.append(_few_colours(picture, frames[:1]))
-                times = _frame_times(len(frames), rate)
-                frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=times, loop=0)
-            else:
-                with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
-                    warnings.simplefilter("ignore", RuntimeWarning)
-                    with imageio.get_writer(file, format=".mp4", fps=rate, macro_block_size=None) as writer:
-                        yield writer.append_data
-    except OSError as error:
-        raise DelayRLError(f"cannot write {out}: {error.strerror or error}") from error
+    with disk_errors(out), draft(out) as name, name.open("wb") as file:
+        if out.suffix == ".gif":
+            frames: list[Image.Image] = []
+            yield lambda picture: frames.append(_few_colours(picture, frames[:1]))
+            times = _frame_times(len(frames), rate)
+            frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=times, loop=0)
+        else:
+            with warnings.catch_warnings():  # the encoder is forked while JAX's idle threads exist
+                warnings.simplefilter("ignore", RuntimeWarning)
+                with imageio.get_writer(file, format=".mp4", fps=rate, macro_block_size=None) as writer:
+                    yield writer.append_data
 
 
 def _frame_times(frames: int, rate: float) -> list[int]:

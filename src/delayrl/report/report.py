@@ -10,6 +10,7 @@ from delayrl.report.markdown import markdown
 from delayrl.report.page import page
 from delayrl.report.summary import summarise
 from delayrl.run.cell import Standing
+from delayrl.run.disk import disk_errors, write_file
 
 
 def report(
@@ -36,12 +37,10 @@ def report(
     out, summary = Path(out), summarise(rows, standing, configs)
     if not summary.results:
         raise DelayRLError("there is nothing to report: no cells and no rows")
-    try:
+    with disk_errors(out):
         pictures = figures.draw(summary, out / "img")
         text = markdown(summary, title, pictures, description)
-        (out / "report.md").write_text(text, encoding="utf-8", errors="replace")
+        write_file(out / "report.md", text.encode(errors="replace"))
         text = page(summary, title, description)
-        (out / "report.html").write_text(text, encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise DelayRLError(f"the report cannot be written to {out}: {error.strerror or error}") from error
+        write_file(out / "report.html", text.encode(errors="replace"))
     return out / "report.html"
