@@ -57,6 +57,8 @@ def test_without_anchors_there_are_raw_returns_and_nothing_else() -> None:
         entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
         assert math.isnan(entry.value)
         assert entry.raw == 3
+        lacks = {"sac": "SAC without a delay", "random": "the random policy"}[missing]
+        assert f"Returns on delayrl/Ant-v4 are not normalised: {lacks} has no rows" in markdown(summary, "t", {})
         assert math.isnan(entry.area)
         assert np.isnan(entry.interval).all()
         assert not summary.aggregates
@@ -156,7 +158,12 @@ def test_the_threshold_alone_may_be_of_a_longer_reference() -> None:
 def test_a_reference_that_is_worse_than_random_normalises_nothing() -> None:
     cells = small()
     curves = anchored(cells, sac=[[0.0, 0, 5], [0.0, 0, 5]], vdpo=[[0.0, 0, 50], [0.0, 0, 50]])
-    result = of(summarise(curves, [*cells.values()]), "vdpo")
+    summary = summarise(curves, [*cells.values()])
+    line = (
+        "Returns on delayrl/Ant-v4 are not normalised: SAC without a delay (5.00) is not better than the random policy"
+    )
+    assert f"{line} (10.0)." in markdown(summary, "t", {})
+    result = of(summary, "vdpo")
     assert np.isnan(result.normalise(result.curves.final)).all()
     assert np.isnan([result.threshold, result.steps_to_threshold, *result.steps_interval]).all()
 
@@ -334,7 +341,7 @@ def test_overrides_of_a_task_do_not_part_an_agent() -> None:
     assert summary.shared == {("bpql", "Hopper-v4"): {"steps": 200}, ("vdpo", "Hopper-v4"): {"steps": 200}}
     line = "Overridden in all cells of bpql, vdpo on Hopper-v4: steps=200."
     assert line in markdown(summary, "t", {})
-    assert payload(summary, "t")["remarks"] == [line]
+    assert payload(summary, "t")["remarks"][-1] == line
     (met,) = [c for c in summary.comparisons if (c.one, c.other) == ("bpql", "vdpo")]
     assert met.tasks == 2
 

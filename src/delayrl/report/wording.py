@@ -238,8 +238,23 @@ def overrides(summary: Summary) -> list[str]:
     ]
 
 
+def raw(summary: Summary) -> list[str]:
+    """Write on which tasks returns are not normalised, and why."""
+    tasks: dict[str, list[str]] = {}
+    for result in summary.results.values():
+        random, reference = result.random_anchor.value, result.reference_anchor.value
+        if result.is_anchor or not result.runs or reference > random:
+            continue
+        why = f"SAC without a delay ({number(reference)}) is not better than the random policy ({number(random)})"
+        if math.isnan(random) or math.isnan(reference):
+            lacks = "the random policy" if math.isnan(random) else "SAC without a delay"
+            why = f"{lacks} has no rows of this protocol, preset and length"
+        tasks.setdefault(why, []).append(result.place.env)
+    return [f"Returns on {', '.join(dict.fromkeys(own))} are not normalised: {why}." for why, own in tasks.items()]
+
+
 def remarks(summary: Summary) -> list[str]:
-    """Write what must be known of all results: rows left out, tasks and agents that changed, overrides."""
+    """Write what must be known of all results: rows left out, raw returns, what changed, overrides."""
     line = f"{summary.unplaced:,} rows belong to no cell of the grid; they are left out."
     left_out = [line] if summary.unplaced else []
     changed = [
@@ -251,7 +266,7 @@ def remarks(summary: Summary) -> list[str]:
         f"The modules of {agent} changed between its runs: returns of different agents may stand together."
         for agent in summary.recoded
     ]
-    return left_out + changed + recoded + overrides(summary)
+    return left_out + raw(summary) + changed + recoded + overrides(summary)
 
 
 def made_with(versions: Sequence[Mapping[str, Any]]) -> list[str]:
