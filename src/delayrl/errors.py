@@ -92,7 +92,7 @@ def did_you_mean(near: Sequence[str], otherwise: str = "") -> str:
 
 def count(number: int, noun: str) -> str:
     """Write a number of things, in the plural unless there is one."""
-    return f"{number:,} {noun}{'s' * (number != 1)}"
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def first_line(error: BaseException) -> str:

@@ -12,6 +12,7 @@ import pytest
 
 from delayrl.errors import DelayRLError
 from delayrl.run.checkpoint import checkpoint_folders
+from delayrl.run.disk import lock
 from delayrl.run.folder import RunFolder
 
 WEIGHTS = {"w": np.ones(3, np.float32)}
@@ -159,6 +160,19 @@ def test_what_is_no_checkpoint_or_piece_is_left_alone(run: RunFolder) -> None:
     run.drop_pieces()
     assert [path.name for path in checkpoint_folders(run.path)] == ["000000000100"]
     assert sorted(path.name for path in (run.path / "replay").iterdir()) == ["mine", "notes.txt"]
+
+
+def test_what_may_only_be_read_is_locked(tmp_path: Path, monkeypatch) -> None:
+    opened = os.open
+
+    def refuse(path: object, flags: int, *more: int) -> int:
+        if flags & os.O_RDWR:
+            raise PermissionError
+        return opened(path, flags, *more)
+
+    monkeypatch.setattr(os, "open", refuse)
+    with lock(tmp_path) as free, lock(tmp_path) as again:
+        assert (free, again) == (True, False)
 
 
 def test_a_pipe_is_no_run(tmp_path: Path) -> None:

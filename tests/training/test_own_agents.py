@@ -143,7 +143,38 @@ def test_a_class_that_derives_from_ours_has_its_presets() -> None:
         assert values_of(of_late) == values_of(AGENTS["sac"].presets[preset].agent)
         assert of_late.actor_sees == "augmented"
         assert as_agent(VDPO).registration.presets[preset].agent == ours.agent
-    assert as_agent(Wide).registration.official == AGENTS["vdpo"].official
+    for given in (Wide, Wide()):
+        assert as_agent(given).registration.official == AGENTS["vdpo"].official
+
+
+@dataclass(frozen=True)
+class Large(SAC):
+    """Refuses the batch of a preset."""
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 200:
+            raise ValueError("too small")
+
+
+class Bare(VDPO):
+    width: Annotated[int, "of no dataclass, and so without effect"] = 32
+
+
+def test_a_class_that_does_not_take_our_values_has_its_own() -> None:
+    """One that refuses a value has presets that set the schedule alone; one that is no dataclass declares nothing."""
+    entry = as_agent(Large).registration
+    assert [preset.agent for preset in entry.presets.values()] == [Large()] * 3
+    assert entry.official == AGENTS["sac"].official
+    widths = [preset.agent.width for preset in as_agent(Bare).registration.presets.values()]
+    assert widths == [preset.agent.width for preset in AGENTS["vdpo"].presets.values()]
+
+
+def test_a_run_does_not_go_on_under_other_rules(tmp_path: Path) -> None:
+    run = train("random", tmp_path, protocol="official")
+    changed = run.config | {"habits": run.config["habits"] | {"time_limit": "dropped"}}
+    (run.path / "config.json").write_text(json.dumps(changed))
+    with pytest.raises(DelayRLError, match="the protocol official of random is another now: the run cannot go on"):
+        delayrl.go_on(run, 400, progress=False)
 
 
 def test_the_command_line_takes_a_preset_that_there_is(capsys) -> None:

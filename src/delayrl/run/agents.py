@@ -12,7 +12,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -216,22 +216,31 @@ def check_not_taken(name: str, agent: Agent) -> None:
         raise DelayRLError(f"{name} has an option {taken[0]}, and so has delayrl.train: give it another name")
 
 
-def _entry(given: Any, made: Agent) -> Registration:
+def _entry(given: Any, made: Any) -> Registration:
     """Return an entry for an own agent, whose presets differ in the schedule alone.
 
-    A class that derives from one of ours has that agent's presets and protocols, but for the fields that it declares.
+    If its class derives from one of ours, its protocols are that agent's. Of a class that is given without values, the
+    presets are too, but for the fields that it declares or has another default of.
     """
-    for number, base in enumerate(given.__mro__ if isinstance(given, type) else ()):
+    own = registered(_summary(made), made)
+    for number, base in enumerate(kinds := type(made).__mro__):
         if ours := _agent_with_defaults_of(base):
-            declared = {name for kind in given.__mro__[:number] for name in inspect.get_annotations(kind)}
+            own = own._replace(official=ours.official)
+            if not isinstance(given, type):
+                return own
+            decorated = [kind for kind in kinds[:number] if "__dataclass_fields__" in vars(kind)]
+            declared = {name for kind in decorated for name in inspect.get_annotations(kind)}
+            usual = {f.name: getattr(base(), f.name) for f in fields(base) if f.name not in declared}
+            kept = [name for name, value in usual.items() if getattr(made, name) == value]
             presets = {}
             for name, preset in ours.presets.items():
-                values = {field.name: getattr(preset.agent, field.name) for field in fields(base)}
-                with one_line(f"{given.__name__} cannot be made with the preset {name} of {base.__name__}"):
-                    agent = given(**{name: value for name, value in values.items() if name not in declared})
-                presets[name] = preset._replace(agent=agent)
-            return ours._replace(summary=_summary(made), paper="-", presets=presets)
-    return registered(_summary(made), made)
+                values: Any = {part: x for part in kept if (x := getattr(preset.agent, part)) != usual[part]}
+                try:
+                    presets[name] = preset._replace(agent=replace(made, **values) if values else made)
+                except Exception:  # whatever its own code raises for values that it does not take
+                    return own
+            return own._replace(presets=presets)
+    return own
 
 
 def _agent_with_defaults_of(kind: type) -> Registration | None:

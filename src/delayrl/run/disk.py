@@ -83,7 +83,10 @@ def lock(path: Path, *, shared: bool = False, patience: float = 0) -> Iterator[b
     except ImportError:
         yield True
         return
-    handle = os.open(path, os.O_RDONLY if shared or path.is_dir() else os.O_RDWR)  # NFS locks what can be written
+    try:
+        handle = os.open(path, os.O_RDWR)  # NFS locks what can be written
+    except OSError:  # a folder, or what may only be read
+        handle = os.open(path, os.O_RDONLY)
     try:
         free, give_up = False, time.monotonic() + patience
         while not free:

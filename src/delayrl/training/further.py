@@ -91,6 +91,10 @@ def setup_of(config: Mapping[str, Any], agent: AgentLike, task: Task, delay: Del
     known = {name for part in presets.get(config["preset"], ()) for name in values_of(part)}
     older = {name: value for name, value in OLDER.items() if name in known}
     setup = resolve(agent, task, delay, config["preset"], config["protocol"], {**older, **stored, "steps": steps})
+    if setup.config.get("habits", {}) != config.get("habits", {}):
+        raise DelayRLError(
+            f"the protocol {config['protocol']} of {config['agent']} is another now: the run cannot go on"
+        )
     origin = dict(config.get("origin", {}))
     if config["schedule"]["steps"] != steps:
         origin["lengths"] = [*origin.get("lengths", []), config["schedule"]["steps"]]

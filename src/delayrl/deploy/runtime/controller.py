@@ -31,7 +31,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,29 +66,31 @@ class ControlPolicy(Protocol):
     It may have `action_delay` and `min_age` besides, in steps: the defaults of the Controller's arguments.
     """
 
-    @property
-    def obs_size(self) -> int:
-        """Return S."""
+    if TYPE_CHECKING:  # attributes, fields of a frozen dataclass and properties will all do
 
-    @property
-    def action_size(self) -> int:
-        """Return A."""
+        @property
+        def obs_size(self) -> int:
+            """Return S."""
 
-    @property
-    def low(self) -> NDArray[Any]:
-        """Return the least action in range, [A]."""
+        @property
+        def action_size(self) -> int:
+            """Return A."""
 
-    @property
-    def high(self) -> NDArray[Any]:
-        """Return the largest action in range, [A]."""
+        @property
+        def low(self) -> NDArray[Any]:
+            """Return the least action in range, [A]."""
 
-    @property
-    def max_age(self) -> int:
-        """Return Δ, the longest age that it accepts, in steps."""
+        @property
+        def high(self) -> NDArray[Any]:
+            """Return the largest action in range, [A]."""
 
-    @property
-    def dt(self) -> float | None:
-        """Return the seconds of a step; None if unknown."""
+        @property
+        def max_age(self) -> int:
+            """Return Δ, the longest age that it accepts, in steps."""
+
+        @property
+        def dt(self) -> float | None:
+            """Return the seconds of a step; None if unknown."""
 
     def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
         """Return the action [A] for an observation [S] of this age and the actions [Δ, A] since.
