@@ -216,31 +216,37 @@ def check_not_taken(name: str, agent: Agent) -> None:
         raise DelayRLError(f"{name} has an option {taken[0]}, and so has delayrl.train: give it another name")
 
 
-def _entry(given: Any, made: Any) -> Registration:
+def _entry(given: Any, made: Agent) -> Registration:
     """Return an entry for an own agent, whose presets differ in the schedule alone.
 
-    If its class derives from one of ours, its protocols are that agent's. Of a class that is given without values, the
-    presets are too, but for the fields that it declares or has another default of.
+    If its class derives from one of ours, its protocols are that agent's. If it is given as a class, without values,
+    its presets are that agent's too, as far as it takes their values.
     """
     own = registered(_summary(made), made)
-    for number, base in enumerate(kinds := type(made).__mro__):
-        if ours := _agent_with_defaults_of(base):
-            own = own._replace(official=ours.official)
-            if not isinstance(given, type):
-                return own
-            decorated = [kind for kind in kinds[:number] if "__dataclass_fields__" in vars(kind)]
-            declared = {name for kind in decorated for name in inspect.get_annotations(kind)}
-            usual = {f.name: getattr(base(), f.name) for f in fields(base) if f.name not in declared}
-            kept = [name for name, value in usual.items() if getattr(made, name) == value]
-            presets = {}
-            for name, preset in ours.presets.items():
-                values: Any = {part: x for part in kept if (x := getattr(preset.agent, part)) != usual[part]}
-                try:
-                    presets[name] = preset._replace(agent=replace(made, **values) if values else made)
-                except Exception:  # whatever its own code raises for values that it does not take
-                    return own
-            return own._replace(presets=presets)
-    return own
+    ours = next(filter(None, map(_agent_with_defaults_of, type(made).__mro__)), None)
+    if ours is None:
+        return own
+    own = own._replace(official=ours.official)
+    if not isinstance(given, type):
+        return own
+    try:
+        presets = {name: preset._replace(agent=_as(preset.agent, made)) for name, preset in ours.presets.items()}
+    except Exception:  # whatever its own code raises for values that it does not take
+        return own
+    return own._replace(presets=presets)
+
+
+def _as(preset: Any, made: Any) -> Any:
+    """Return an agent with a preset's values, but for fields that its class declares or has another default of."""
+    base, kinds = type(preset), type(made).__mro__
+    decorated = [kind for kind in kinds[: kinds.index(base)] if "__dataclass_fields__" in vars(kind)]
+    declared = {name for kind in decorated for name in inspect.get_annotations(kind)}
+    usual = base()
+    values = {}
+    for name in {field.name for field in fields(base)} - declared:
+        if getattr(made, name) == getattr(usual, name) != getattr(preset, name):
+            values[name] = getattr(preset, name)
+    return replace(made, **values)
 
 
 def _agent_with_defaults_of(kind: type) -> Registration | None:
