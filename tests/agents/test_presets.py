@@ -4,8 +4,9 @@ import pytest
 
 from delayrl.agents.dcac import TEMPERATURE_RATE
 from delayrl.agents.registry import AGENTS
-from delayrl.run.condition import overrides_of, resolve
+from delayrl.run.condition import resolve
 from delayrl.run.configuration import values_of
+from delayrl.run.stored import overrides_of
 
 ANY_AGE = {
     "second_age": "random",

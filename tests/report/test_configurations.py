@@ -15,9 +15,10 @@ from delayrl.report.markdown import markdown
 from delayrl.report.page import payload
 from delayrl.report.rows import read_rows
 from delayrl.report.summary import Summary, summarise
-from delayrl.run.condition import overrides_of, resolve
+from delayrl.run.condition import resolve
 from delayrl.run.cost import Cost
 from delayrl.run.folder import RunFolder
+from delayrl.run.stored import overrides_of
 
 COST = Cost(12_345, {"actor": 0.5, "critic": 1.0, "temperature": 0.5}, (128,), 3.2e9)
 

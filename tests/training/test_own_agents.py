@@ -30,8 +30,9 @@ from delayrl.play.run import Run
 from delayrl.play.video import watch
 from delayrl.run.agents import TAKEN, as_agent, code_of, find_agent, known_agents
 from delayrl.run.arrays import flatten_tree
-from delayrl.run.condition import overrides_of, resolve
+from delayrl.run.condition import resolve
 from delayrl.run.configuration import values_of
+from delayrl.run.stored import overrides_of
 from own_agents import Shrink
 from own_tasks import Arm, make_arm, write_module
 from short_runs import arrays, declare

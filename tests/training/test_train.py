@@ -1,7 +1,9 @@
 """Runs: from the command to rows, stopped and resumed, damaged and refused."""
 
+import inspect
 import json
 import shutil
+import typing
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -213,6 +215,7 @@ def test_several_seeds(tmp_path: Path) -> None:
     assert [run.path for run in again] == [run.path for run in runs]
     assert [run.path.name for run in runs] == ["seed3", "seed4"]
     alone = train("bpql", tmp_path / "alone", seed=4, steps=150)
+    assert [run.path for run in train("bpql", tmp_path / "alone", seed=4, seeds=1, steps=150)] == [alone.path]
     for a, b in zip(runs[1].rows(), alone.rows(), strict=True):
         assert a["reset_seed"] == b["reset_seed"]
         np.testing.assert_allclose(a["return"], b["return"], rtol=1e-3)
@@ -336,6 +339,16 @@ def test_an_environment_that_fails(method: str, tmp_path: Path) -> None:
         delayrl.DelayRLError, match=f"^Failing failed in {method}: ZeroDivisionError: .*own_tasks.py, line"
     ):
         train("random", tmp_path / "run", env=failing(method))
+
+
+def test_editors_see_every_argument_of_train() -> None:
+    one, several = typing.get_overloads(delayrl.train)
+    shown, real = (dict(inspect.signature(function).parameters) for function in (one, delayrl.train))
+    assert list(shown) == list(real)
+    for name in real:
+        assert name == "seeds" or shown[name].annotation == real[name].annotation, name
+        assert (shown[name].default is ...) == (real[name].default is not inspect.Parameter.empty), name
+    assert several.__annotations__["seeds"] | None == real["seeds"].annotation
 
 
 def test_seeds_of_numpy() -> None:

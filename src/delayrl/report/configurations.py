@@ -8,9 +8,9 @@ from typing import Any
 
 from delayrl.errors import DelayRLError
 from delayrl.report.rows import Key, RowGroup, whole_lines
-from delayrl.run.condition import Condition, overrides_of
 from delayrl.run.folder import RunFolder, check_more
 from delayrl.run.rows import CONDITION, CONFIGURATION
+from delayrl.run.stored import condition_of, overrides_of
 
 Config = Mapping[str, Any]
 """What a run's config.json holds."""
@@ -51,7 +51,7 @@ def by_key(configs: Iterable[Config]) -> dict[Key, Config]:
     known: dict[Key, Config] = {}
     for config in configs:
         if "configuration" in config:
-            condition = Condition.from_json({"overrides": {}, "steps": 0, **config})
+            condition = condition_of({"overrides": {}, "steps": 0, **config})
             if not isinstance(config.get("schedule"), dict) or "steps" not in config["schedule"]:
                 raise DelayRLError(f"the configuration of {condition} has no schedule with its steps")
             known[*condition.columns.values(), config["configuration"]] = config

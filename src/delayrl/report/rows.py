@@ -13,6 +13,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
 from delayrl.run.cost import Cost
 from delayrl.run.rows import CONDITION, CONFIGURATION, Row, name_configuration, whole_evaluations
+from delayrl.run.stored import condition_of
 
 LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
 
@@ -105,7 +106,7 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
 
 
 def _group(row: Mapping[str, Any]) -> RowGroup:
-    condition = Condition.from_json({name: row[name] for name in CONDITION} | {"overrides": {}, "steps": 0})
+    condition = condition_of({name: row[name] for name in CONDITION} | {"overrides": {}, "steps": 0})
     if isinstance(condition.delay, bool) or (isinstance(condition.delay, int) and abs(condition.delay) >= 2**31):
         raise ValueError
     cell, configuration = (None if row.get(name) is None else str(row[name]) for name in ("cell", CONFIGURATION))

@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple, Self
 
 from delayrl.errors import DelayRLError
 from delayrl.run.condition import Condition
+from delayrl.run.stored import condition_of
 
 CellState = Literal["todo", "begun", "running", "done", "failed"]
 """`begun`: something is stored, and nobody works on it."""
@@ -29,7 +30,7 @@ class Cell:
     @property
     def json(self) -> dict[str, Any]:
         """What cell.json and the table of results store of it, without its id."""
-        return self.condition.json | {"seeds": list(self.seeds)}
+        return asdict(self.condition) | {"seeds": list(self.seeds)}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], id: str) -> Self:
@@ -37,7 +38,7 @@ class Cell:
         seeds = values.get("seeds")
         if not isinstance(seeds, list):
             raise DelayRLError("no good seeds")
-        return cls(Condition.from_json(values), tuple(seeds), id)
+        return cls(condition_of(values), tuple(seeds), id)
 
     def __str__(self) -> str:
         first, last = self.seeds[0], self.seeds[-1]

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self
+from typing import Any
 
 from delayrl.agents.base import Agent, Schedule
 from delayrl.agents.registry import Preset
@@ -16,7 +16,7 @@ from delayrl.envs.making import delay_of
 from delayrl.envs.task import Task, TaskLike, as_task
 from delayrl.errors import DelayRLError
 from delayrl.lookup import contents
-from delayrl.run.agents import AgentLike, as_agent, as_trained, check_not_taken, find_agent
+from delayrl.run.agents import AgentLike, as_agent, as_trained, check_not_taken
 from delayrl.run.configuration import OLDER, check_names, options, override, values_of
 from delayrl.run.rows import CONDITION
 
@@ -25,7 +25,6 @@ GROWS: Mapping[str, Sequence[str]] = {
     "small": ("replay_capacity", "evaluate_every", "random_steps"),
 }
 """Options of which a longer run than the preset's needs more."""
-KINDS = CONDITION | {"overrides": dict, "steps": int}
 
 
 @dataclass(frozen=True)
@@ -54,19 +53,6 @@ class Condition:
     def columns(self) -> dict[str, Any]:
         """What every row says of its condition."""
         return {name: getattr(self, name) for name in CONDITION} | {"delay": self.short_delay}
-
-    @property
-    def json(self) -> dict[str, Any]:
-        """All fields, as a cell's file and a table of results hold them."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Make a condition of stored values. Raises DelayRLError if one is missing or of another type."""
-        wrong = [name for name, kind in KINDS.items() if not isinstance(values.get(name), kind)]
-        if wrong:
-            raise DelayRLError(f"no good {', '.join(wrong)}")
-        return cls(**{name: values[name] for name in KINDS})
 
     def __str__(self) -> str:
         return f"{self.agent} on {self.env}, delay {self.short_delay}"
@@ -170,22 +156,3 @@ def following(name: str, preset: Preset, steps: int) -> dict[str, int]:
     scaled = [option.name for option in options(preset.agent) if option.scales]
     names = (*scaled, *(GROWS.get(name, ()) if steps > length else ()))
     return {name: -(-usual[name] * steps // length) for name in names if name in usual and steps != length}
-
-
-def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a run's configuration that differ from its preset's; none if we do not know the preset.
-
-    Nothing is imported because a configuration names it: agents given as `module:object` count as unknown.
-    """
-    try:
-        if ":" in config["agent"]:
-            return {}
-        registration = find_agent(config["agent"])
-        preset, chosen = registration.presets[config["preset"]], registration.protocol(config["protocol"])
-    except (KeyError, DelayRLError):
-        return {}
-    habits = {**following(config["preset"], preset, config["schedule"]["steps"]), **chosen.overrides}
-    usual = {k: v for part in preset for k, v in values_of(override(part, habits)).items()}
-    implied = {name: value for name, value in OLDER.items() if name in usual}
-    options = {**implied, **config["hyperparameters"], **config["schedule"]}
-    return {name: value for name, value in options.items() if name not in usual or usual[name] != value}

@@ -10,9 +10,10 @@ from delayrl.envs.task import Task, TaskLike, as_task, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike, find_agent
-from delayrl.run.condition import Setup, overrides_of, resolve
+from delayrl.run.condition import Setup, resolve
 from delayrl.run.configuration import OLDER, values_of
 from delayrl.run.folder import RunFolder, RunLike, path_of, seed_folders
+from delayrl.run.stored import overrides_of
 from delayrl.training.state import Callback, Ways
 from delayrl.training.train import train_group
 

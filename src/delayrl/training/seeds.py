@@ -16,9 +16,11 @@ MOST = 10_000
 """Seeds that one call may train: they are trained in lockstep."""
 
 
-def seed_numbers(seed: int, seeds: int | Sequence[int]) -> list[int]:
-    """Return the seeds to train: `seeds` many from `seed` on, or those listed. Raises DelayRLError for bad ones."""
+def seed_numbers(seed: int, seeds: int | Sequence[int] | None) -> list[int]:
+    """Return the seeds to train: `seeds` many from `seed` on, those listed, or one. Raises DelayRLError if bad."""
     check_seed(seed)
+    if seeds is None:
+        return [int(seed)]
     if isinstance(seeds, int | np.integer):
         if not 1 <= seeds <= MOST:
             raise DelayRLError(f"seeds must be from 1 to {MOST:,}; got {seeds}")

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -37,11 +37,33 @@ from delayrl.training.state import Callback, Group, Ways
 
 
 @overload
-def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: Literal[1] = 1, **more: Any) -> Run: ...
+def train(
+    agent: AgentLike,
+    env: TaskLike,
+    delay: DelayLike = ...,
+    *,
+    env_kwargs: Mapping[str, Any] | None = ...,
+    wrappers: WrapperLike | Sequence[WrapperLike] = ...,
+    flatten: bool = ...,
+    preset: str = ...,
+    seed: int = ...,
+    seeds: None = ...,
+    out: str | Path | None = ...,
+    device: str | None = ...,
+    overwrite: bool = ...,
+    protocol: str = ...,
+    track: str | None = ...,
+    threads: int = ...,
+    slim: bool = ...,
+    start_from: RunLike | None = ...,
+    callback: Callback | None = ...,
+    progress: bool = ...,
+    **values: Any,
+) -> Run: ...
 @overload
-def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: Sequence[int], **more: Any) -> list[Run]: ...
-@overload
-def train(agent: AgentLike, env: TaskLike, delay: DelayLike = 0, *, seeds: int, **more: Any) -> Run | list[Run]: ...
+def train(
+    agent: AgentLike, env: TaskLike, delay: DelayLike = ..., *, seeds: int | Sequence[int], **more: Any
+) -> list[Run]: ...
 def train(
     agent: AgentLike,
     env: TaskLike,
@@ -52,7 +74,7 @@ def train(
     flatten: bool = False,
     preset: str = "paper",
     seed: int = 0,
-    seeds: int | Sequence[int] = 1,
+    seeds: int | Sequence[int] | None = None,
     out: str | Path | None = None,
     device: str | None = None,
     overwrite: bool = False,
@@ -77,8 +99,8 @@ def train(
         flatten: as `make`.
         preset: "paper", "matched" or "small": which hyperparameters to start from (docs/cli.md).
         seed: fixes everything: environments, networks, sampling.
-        seeds: trains the seeds seed .. seed + seeds - 1 in lockstep, or those of a list.
-        out: the run folder of one seed, of a list of one too; of several seeds the folder of their run folders.
+        seeds: a number N trains the seeds seed .. seed + N - 1 in lockstep, a list those in it; None trains one.
+        out: the run folder of one seed; of several seeds the folder of their run folders.
         device: "cpu" or "gpu"; None leaves the choice to JAX.
         overwrite: start afresh where a run exists.
         protocol: "corrected", or "official": the released code's habits (docs/protocols.md).
@@ -93,7 +115,7 @@ def train(
         **values: any hyperparameter or schedule option by name.
 
     Returns:
-        The run, or the list of runs if `seeds` is above 1 or a list.
+        The run, or the list of runs if `seeds` is given.
 
     Raises:
         DelayRLError: bad input, a damaged run, NaN from the environment, a full disk; a StoppedError after Ctrl-C.
@@ -108,7 +130,7 @@ def train(
     ways = Ways(device=device, track=track, threads=threads, slim=slim, callback=callback, progress=progress)
     train_group(setup, numbers, folders, ways, given=delay, overwrite=overwrite, source=source)
     runs = [Run(folder.path) for folder in folders]
-    return runs[0] if seeds == 1 else runs
+    return runs[0] if seeds is None else runs
 
 
 def train_group(
