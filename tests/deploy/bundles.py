@@ -30,8 +30,8 @@ OBS, LOW, HIGH = 10, np.array([-0.4, -2.0], np.float32), np.array([0.4, 3.0], np
 """Reacher's sizes; a range of actions that is neither symmetric nor the same for all."""
 
 
-def policy_of(name: str, seed: int = 0) -> Policy:
-    spec = Spec(OBS, len(LOW), 0 if name == "sac" else DELAY)
+def policy_of(name: str, seed: int = 0, delay: int = DELAY) -> Policy:
+    spec = Spec(OBS, len(LOW), 0 if name == "sac" else delay)
     return Policy(AGENTS[name], random_state(AGENTS[name], spec, seed), spec, LOW, HIGH)
 
 

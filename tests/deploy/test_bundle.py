@@ -21,9 +21,10 @@ from delayrl import deploy
 from delayrl.cli.main import main
 from delayrl.deploy import Bundle, load_bundle
 from delayrl.deploy.backends.network import parse
+from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.export import network_of
 from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, read_files, seal, write_files
-from delayrl.deploy.packing import pack
+from delayrl.deploy.packing import check_same, pack
 from delayrl.errors import DelayRLError
 
 
@@ -439,3 +440,11 @@ def test_the_command_line_says_it_in_one_line(bundle: Path, tmp_path: Path, caps
         assert (end.value.code, out, err.count("\n")) == (2, "", 1)
         assert "not a safetensors file" in err
     assert not (tmp_path / "executed").exists()
+
+
+def test_the_check_of_an_export_sees_the_oldest_ages() -> None:
+    network, arrays = network_of(policy_of("bpql", delay=300))
+    act = numpy_policy(network, arrays)
+    check_same(network, arrays, act, "differs")
+    with pytest.raises(DelayRLError, match=r"^differs: at age 300 it is"):
+        check_same(network, arrays, lambda obs, actions, age: act(obs, actions, age) + (age == 300), "differs")

@@ -288,6 +288,18 @@ def test_without_a_visible_state_rewards_tell() -> None:
     assert delays(Delayed(Hidden(), 3))[1] == [3]  # from info["truth"]
 
 
+@pytest.mark.parametrize(("low", "high"), [(0, np.inf), (5, np.inf), (-np.inf, -3)])
+def test_pushes_stay_within_a_space_of_one_bound(low: float, high: float) -> None:
+    class Careful(Hidden):
+        action_space = Box(low, high, (1,), np.float32)
+
+        def step(self, action):
+            assert self.action_space.contains(action)
+            return super().step(action)
+
+    assert delays(Careful())[2] == [0]
+
+
 def test_needs_only_numpy_and_gymnasium() -> None:
     heavy = {"jax", "matplotlib", "mujoco", "pyarrow"}
     code = f"import sys, delayrl.measure; print({heavy} & set(sys.modules))"

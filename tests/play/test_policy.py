@@ -80,3 +80,13 @@ def test_policy_refuses_what_it_does_not_know(vdpo: Run) -> None:
     for info in ({}, {"age": 1}, {"actions": actions}):
         with pytest.raises(delayrl.DelayRLError, match=r"the info that `Delayed` gives: it has no age and actions"):
             policy.act(obs, info)
+    for age in (2.7, None, "2"):
+        with pytest.raises(delayrl.DelayRLError, match="an age counts whole steps"):
+            policy.act(obs, {"age": age, "actions": actions})
+    with pytest.raises(delayrl.DelayRLError, match="arrays of numbers"):
+        policy.act(obs, {"age": 2, "actions": [[0, 0], [0]]})
+    for wrong in ([["left", "right"]], [[None, None]], [[1j, 0]]):
+        with pytest.raises(delayrl.DelayRLError, match="real numbers"):
+            policy.act(obs, {"age": 1, "actions": wrong})
+    unknown = np.vstack([actions[:2], [[np.nan, np.nan]]])  # what it does not read is not refused
+    np.testing.assert_array_equal(*(policy.act(obs, {"age": 2, "actions": given}) for given in (actions, unknown)))

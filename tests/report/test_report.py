@@ -86,6 +86,19 @@ def test_command(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+def test_command_of_a_missing_file_and_of_the_base_alone(tmp_path: Path) -> None:
+    words = ["none.jsonl", "--out", "out"]
+    command = [sys.executable, "-m", "delayrl.report", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, "delayrl: none.jsonl cannot be read: No such file or directory\n")
+    code = (
+        "import sys; sys.modules['scipy'] = None; import runpy; runpy.run_module('delayrl.report', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "scipy" in done.stderr
+
+
 @pytest.mark.parametrize("content", ['{"step": 1', '{"a": 1}', "[1]", '{"config": 5}', "\ud800"])
 def test_command_of_a_bad_file(
     content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -38,6 +38,9 @@ def test_several_seeds_are_told_how_they_would_be_faster(monkeypatch: pytest.Mon
     assert machine.shared(5, device="cpu").startswith("seeds: 5 share one process; 2 processes of one core each")
     assert machine.shared(1, device=None) == ""
     monkeypatch.setattr(machine, "entry_points", lambda group: ["cuda"])
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
     assert machine.shared(2, device=None) == machine.shared(2, device="gpu") == ""
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # the plugin is installed, and not used
+    assert machine.shared(2, device=None)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {4})
     assert machine.shared(2, device="cpu") == ""

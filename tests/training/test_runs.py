@@ -232,6 +232,8 @@ def test_compare_does_not_pool_other_options(tmp_path: Path, capsys: pytest.Capt
 
 def test_compare_says_what_a_run_began_from() -> None:
     origin = {"agent": "bpql", "env": "Walk", "delay": 2, "seed": 0, "step": 400, "networks": 5 * "d2e63b2c5ccd"}
+    own, other = {"delay": "<Burst:5>", "unnamed": {"delay": "99ff"}}, {"delay": 5}
+    assert differences([own, other]) == [["delay", "<Burst:5>", 5], ["what delay holds", "99ff", "-"]]
     (row,) = differences([{"agent": "bpql"}, {"agent": "bpql", "origin": {"from": origin}}])
     assert row == ["from", "-", "bpql at step 400, d2e63b2c"]
 

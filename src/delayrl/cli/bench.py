@@ -216,7 +216,7 @@ def _check_backend(given: argparse.Namespace) -> None:
                 raise DelayRLError(f"--{name} needs --backend {backend}; got --backend {given.backend}")
 
 
-def time_limit(text: str) -> float:
+def time_limit(text: str) -> int:
     """Return the seconds of a time such as 90s, 9m, 1h30m or 2d. Raises DelayRLError for another text."""
     match = re.fullmatch(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
     days, hours, minutes, rest = (int(part or 0) for part in match.groups()) if match else (0, 0, 0, 0)

@@ -73,7 +73,9 @@ def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
     options: list[dict[str, Any]] = [{} for _ in configs]
     for own, config in zip(options, configs, strict=True):
         for name, value in config.items():
-            if name not in ABOUT:
+            if name == "unnamed":  # checksums of parts that have no name
+                own |= {f"what {part} holds": checksum for part, checksum in value.items()}
+            elif name not in ABOUT:
                 own |= value if isinstance(value, dict) else {name: value}
         if origin := own.get("from"):
             own["from"] = f"{origin.get('agent')} at step {origin.get('step')}, {str(origin.get('networks'))[:8]}"

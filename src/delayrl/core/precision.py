@@ -14,7 +14,7 @@ BFLOAT16 = ("BF16_BF16_F32", "bfloat16")
 JAX's "bfloat16" is tensorfloat32 on a GPU. With the other name XLA's CPU compiler aborts at some products.
 """
 FEW = 32
-"""Fewer outputs (Q-values, means, log-stds) cost little, and stay in float32 on a CPU."""
+"""Fewer outputs cost little, and stay in float32 on a CPU: Q-values, and those of policies of up to 15 actions."""
 
 
 def setting(precision: Precision) -> str:

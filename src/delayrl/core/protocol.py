@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Opening = Literal["agent", "one-random", "random", "zeros"]
-"""The first actions of an episode under a delay: the agent's; one at random, then the agent's; or at random or zero
-until the observation that the first of them led to arrives."""
+"""The first actions of an episode under a delay of Δ steps: the agent's; one at random, then the agent's; or Δ that are
+random or zero."""
 
 
 @dataclass(frozen=True)

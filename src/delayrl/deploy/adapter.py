@@ -42,10 +42,16 @@ HARMLESS: tuple[Any, ...] = (
     Autoreset,
     NormalizeReward,
     TimeLimit,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    RecordEpisodeStatistics,
+    RecordVideo,
+    RenderCollection,
+    HumanRendering,
 )
-HARMLESS += (OrderEnforcing, PassiveEnvChecker, RecordEpisodeStatistics, RecordVideo, RenderCollection, HumanRendering)
+"""Classes whose `step` and `reset` pass observations and actions on as they are."""
 MONITOR = "stable_baselines3.common.monitor.Monitor"
-"""Classes whose `step` and `reset` pass observations and actions on as they are, and one more by its name."""
+"""One more of them, by its name."""
 
 
 @dataclass(frozen=True)

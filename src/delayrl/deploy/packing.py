@@ -20,14 +20,13 @@ SAMPLES, TOLERANCE = 200, 1e-3
 
 
 def check_same(network: Network, arrays: Arrays, policy: Callable[..., NDArray[Any]], otherwise: str) -> None:
-    """Raise DelayRLError, which begins with `otherwise`, unless the network gives the policy's actions at every age.
+    """Raise DelayRLError, which begins with `otherwise`, unless the network acts as the policy, at ages from 0 to Δ.
 
     `policy` takes the newest observation [S], the actions since [Δ, A] and the age, as a bundle does.
     """
     act, random = numpy_policy(network, arrays), np.random.default_rng(0)
     low, high = np.asarray(network.low), np.asarray(network.high)
-    for sample in range(SAMPLES):
-        age = sample % (network.max_age + 1)
+    for age in np.linspace(0, network.max_age, SAMPLES).round().astype(int).tolist():
         obs = (random.normal(size=network.obs_size) * random.choice([0.1, 1.0])).astype(np.float32)
         actions = np.zeros((network.max_age, network.action_size), np.float32)
         actions[:age] = random.uniform(low, high, (age, network.action_size))

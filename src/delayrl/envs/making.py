@@ -113,6 +113,5 @@ def tasks() -> Iterator[tuple[str, Any, float | None]]:
     small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
     ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
     for name in [f"{task}-v5" for task in paper.TASKS] + small + ours:
-        env = make(name)
-        yield name, env, seconds_of(env)
-        env.close()
+        with closing(make(name)) as env:
+            yield name, env, seconds_of(env)

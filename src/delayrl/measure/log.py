@@ -271,8 +271,9 @@ def _correlated(
     strength = correlate.strength(correlation)[0]
     delay, steps = (first - 1) * row, tuple(rounded_up_steps(d, period) for _, d in windows)
     step = rounded_up_steps(delay, period)
-    fewest, highest = np.quantile(steps, (0.1, 0.9), method="nearest") if len(windows) > 1 else (step, step)
-    shortest, most = np.quantile([d for _, d in windows], (0.1, 0.9)) if len(windows) > 1 else (delay, delay)
+    spread = [d for _, d in windows] if len(windows) > 1 else [delay]
+    fewest, highest = np.quantile([rounded_up_steps(d, period) for d in spread], (0.1, 0.9), method="nearest")
+    shortest, most = np.quantile(spread, (0.1, 0.9))
     return Estimated(
         method="correlation",
         path=str(path),

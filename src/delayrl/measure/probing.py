@@ -116,7 +116,8 @@ def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Ite
         observation = _count_ages([_shown(p.obs, p.channel(channel)) for p in pushes], oldest)
     echo = np.any([repeating(p.echo) for p in pushes], 0)
     reactions = np.concatenate([p.components - 1 - np.arange(len(p.obs))[:, None] for p in pushes])  # negative if none
-    fewest = np.where(reactions >= 0, reactions, np.iinfo(int).max).min(0)
+    never = np.iinfo(int).max
+    fewest = np.where(reactions >= 0, reactions, never).min(0)
     return Probed(
         environment=name,
         total=total or reaction,
@@ -125,7 +126,7 @@ def _probe(env: Env, episodes: int, seed: int, longest: int, wrap: Callable[[Ite
         reaction=reaction,
         action_from=action_from,
         lost=float(np.mean(lost)) if lost else 0.0,
-        components=tuple(None if (reactions[:, c] < 0).all() else int(steps) for c, steps in enumerate(fewest)),
+        components=tuple(None if steps == never else int(steps) for steps in fewest),
         echoes=tuple(int(c) for c in np.flatnonzero(echo)),
         episodes=episodes,
         length=steps,

@@ -151,8 +151,9 @@ def first(effect: Array) -> Array:
 
 
 def _bounds(env: Env) -> tuple[Array, Array]:
-    """Return the bounds of the actions, [A] each; ±1 for a missing bound."""
+    """Return the bounds of the actions, [A] each; a missing one lies 2 from the other, ±1 where both miss."""
     space: Any = env.action_space
     low, high = space.low.astype(float), space.high.astype(float)
-    bounded = (np.abs(low) < 1e6) & (np.abs(high) < 1e6)
-    return np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    has_low, has_high = np.abs(low) < 1e6, np.abs(high) < 1e6
+    least = np.where(has_low, low, np.where(has_high, high - 2, -1.0))
+    return least, np.where(has_high, high, np.where(has_low, low + 2, 1.0))

@@ -123,8 +123,7 @@ def resample(log: Log) -> tuple[Log, float]:
         taken = np.arange(len(log.time))
     else:
         rows = []
-        for piece in range(int(pieces[-1]) + 1):
-            own = np.flatnonzero(pieces == piece)
+        for own in np.split(np.arange(len(log.time)), np.flatnonzero(breaks) + 1):
             grid = np.arange(log.time[own[0]] + step / 2, log.time[own[-1]] + step, step)
             rows.append(own[np.searchsorted(log.time[own], grid, "right") - 1])
         taken = np.concatenate(rows)

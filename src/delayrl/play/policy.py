@@ -1,5 +1,6 @@
 """Trained policies: `load` a run, then `act` on what the wrapper shows."""
 
+import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -76,7 +77,7 @@ class Policy:
         Args:
             obs: the newest observation that has arrived, [S].
             info: `age`, and `actions` [≥ age, A] taken since, oldest first, in the task's own units: what
-                `Delayed` puts there.
+                `Delayed` puts there. Entries after the first `age` are ignored.
 
         Raises:
             DelayRLError: wrong sizes, numbers that are not finite, no age or actions, or an age that the policy was not
@@ -84,7 +85,16 @@ class Policy:
         """
         if not {"age", "actions"} <= info.keys():
             raise DelayRLError("the policy needs the info that `Delayed` gives: it has no age and actions here")
-        obs, actions, age = np.asarray(obs), np.asarray(info["actions"]), int(info["age"])
+        try:
+            age = operator.index(info["age"])
+        except TypeError:
+            raise DelayRLError(f"an age counts whole steps; got {info['age']!r}") from None
+        try:
+            obs, actions = np.asarray(obs), np.asarray(info["actions"])
+        except ValueError:  # rows of several lengths
+            raise DelayRLError("the policy takes arrays of numbers: obs [S] and actions [≥ age, A]") from None
+        if not all(np.can_cast(x.dtype, np.float64, "same_kind") for x in (obs, actions)):
+            raise DelayRLError(f"the policy takes real numbers; got {obs.dtype} and actions of {actions.dtype}")
         if obs.shape != (self.spec.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.spec.obs_size}; got shape {obs.shape}")
         if not 0 <= age <= self.spec.delay:
@@ -94,6 +104,7 @@ class Policy:
             raise DelayRLError(f"actions are rows of {self.spec.action_size} numbers; got shape {actions.shape}")
         if len(actions) < age:
             raise DelayRLError(f"an observation of age {age} needs the {age} actions taken since; got {len(actions)}")
+        actions = actions[:age]
         if not (np.isfinite(obs).all() and np.isfinite(actions).all()):
             raise DelayRLError("the policy was given an observation or an action that is not finite")
         scaled = 2 * (actions - self.low) / (self.high - self.low) - 1

@@ -4,10 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from delayrl.errors import DelayRLError
-from delayrl.report.configurations import read_configs
-from delayrl.report.report import report
-from delayrl.report.rows import read_rows
+from delayrl.errors import DelayRLError, one_line
 
 
 def main() -> None:
@@ -18,6 +15,10 @@ def main() -> None:
     parser.add_argument("--title", default="delayrl", help="title of the report (default: delayrl)")
     given = parser.parse_args()
     try:
+        with one_line("the report cannot be imported"):
+            from delayrl.report.configurations import read_configs
+            from delayrl.report.report import report
+            from delayrl.report.rows import read_rows
         print(report(read_rows(given.rows), [], given.out, given.title, read_configs(given.rows)))
     except DelayRLError as error:
         print(f"delayrl: {error}", file=sys.stderr)

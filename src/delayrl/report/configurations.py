@@ -39,7 +39,7 @@ def read_configs(paths: Iterable[Path]) -> Iterator[Config]:
                 lines = [line for _, line in whole_lines(file) if b'"config"' in line]
             configs = [line["config"] for line in map(json.loads, lines) if "config" in line]
         except (OSError, ValueError, TypeError, RecursionError) as error:
-            raise DelayRLError(f"{path} cannot be read: {error}") from error
+            raise DelayRLError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
         for config in configs:
             if isinstance(config, dict):  # others are refused with the number of their line, as rows are
                 check_more(config, f"a configuration in {path}")

@@ -104,13 +104,12 @@ def _comparisons(summary: Summary, comparisons: Sequence[Comparison]) -> str:
             line = [_escape(wording.delay(delay)), _escape(summary.name(one))]
             for other in labels:
                 c = at.get((delay, one, other))
-                p, *more = wording.comparison_texts(c) if c else ("",)
-                parts = [
-                    f"**{p}**" if c and c.clear else p,
-                    *more[:1],
-                    *(GREY.format(text) for text in more[1:] if text),
-                ]
-                line.append("<br>".join(part for part in parts if part))
+                if c is None:
+                    line.append("")
+                    continue
+                p, interval, *more = wording.comparison_texts(c)
+                parts = [f"**{p}**" if c.clear else p, interval, *(GREY.format(text) for text in more if text)]
+                line.append("<br>".join(filter(None, parts)))
             body.append(line)
     return markdown_table(["Δ", "Agent", *(f"over {_escape(summary.name(label))}" for label in labels)], body)
 

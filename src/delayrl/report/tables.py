@@ -106,6 +106,9 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Ta
         columns |= {agent for agent in PAPER_ORDER if agent not in agents}
     at = {(r.place.env, r.place.delay, r.place.label): r for r in chosen}
     conditions = {r.place.label: r.condition for r in chosen}
+    lengths = defaultdict(set)
+    for r in chosen:
+        lengths[r.place.env, r.place.delay].add(r.condition.steps)
     entries = {}
     for (env, delay), label in product(rows, columns):
         result = at.get((env, delay, label))
@@ -117,8 +120,8 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Ta
         measure = "steps" if kind == "steps" else "normalised"
         key = (measure, env.removeprefix("delayrl/"), str(delay), agent, representation)
         same = overrides.keys() <= SAME_RUN and (result is None or _is_whole(result))  # the paper ran no other variants
-        lengths = {r.condition.steps for r in chosen if (r.place.env, r.place.delay) == (env, delay)}
-        entries[env, delay, label] = _entry(kind, result, values.get(key) if same else None, len(lengths) > 1)
+        published = values.get(key) if same else None
+        entries[env, delay, label] = _entry(kind, result, published, len(lengths[env, delay]) > 1)
     shown = {place for place, entry in entries.items() if entry != TableEntry()}  # all results are in another table
     plain = {label for label in columns if " " not in label} if kind == "ablation" else set()  # not worth a row there
     rows = [row for row in rows if any((*row, label) in shown for label in columns - plain)]

@@ -112,8 +112,8 @@ class RunFolder:
         except ValueError as error:
             raise DelayRLError(f"{file} is damaged: {error}") from error
         if name == "rows":
-            return check_rows(rows, file)
-        if wrong := [row for row in rows if type(row.get("step")) is not int]:
+            check_rows(rows, file)
+        elif wrong := [row for row in rows if type(row.get("step")) is not int]:
             raise DelayRLError(f"{file} is damaged: a line has no step: {str(wrong[0])[:200]}")
         return rows
 
@@ -263,9 +263,9 @@ def _text(file: Path) -> str:
         raise DelayRLError(f"{file} cannot be read: {error.strerror}") from error
 
 
-def _check_config(config: Any, file: Path) -> None:
+def _check_config(config: Mapping[str, Any], file: Path) -> None:
     for name, kind in CONFIG.items():
-        if not isinstance(config, dict) or not isinstance(config.get(name), kind):
+        if not isinstance(config.get(name), kind):
             raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
     if not isinstance(config["schedule"].get("steps"), int):
         raise DelayRLError(f"{file} is damaged: its schedule has no steps")

@@ -1,7 +1,7 @@
 """Rows: one for each evaluation episode, as a run folder's rows.jsonl holds them."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence, Sized
 from typing import Any
 
 import numpy as np
@@ -18,22 +18,21 @@ EPISODE = {"step": int, "policy": str, "episode": int, "reset_seed": int, "retur
 """The columns that differ between the rows of a run, with their types."""
 
 
-def check_row(row: Any, where: object) -> Row:
-    """Return a row of a run folder unchanged. Raises DelayRLError, naming `where`, if it is damaged."""
-    typed = isinstance(row, dict) and all(type(row.get(name)) is kind for name, kind in EPISODE.items())
+def check_row(row: Row, where: object) -> None:
+    """Raise DelayRLError, naming `where`, if a row of a run folder is damaged."""
+    typed = all(type(row.get(name)) is kind for name, kind in EPISODE.items())
     if not typed or not math.isfinite(row["return"]):
         raise DelayRLError(f"{where} holds a damaged row: {str(row)[:200]}")
-    return row
 
 
-def check_rows(rows: Iterable[Any], where: object) -> list[Row]:
-    """Return the rows of a run folder unchanged. Raises DelayRLError if one is damaged, or an episode there twice."""
-    known, whole = set(), [check_row(row, where) for row in rows]
-    for row in whole:
+def check_rows(rows: list[Row], where: object) -> None:
+    """Raise DelayRLError if a row of a run folder is damaged, or an episode there twice."""
+    known = set()
+    for row in rows:
+        check_row(row, where)
         if (episode := (row["policy"], row["step"], row["episode"])) in known:
             raise DelayRLError(f"{where} holds an episode twice: step {row['step']}, {row['policy']}")
         known.add(episode)
-    return whole
 
 
 def whole_evaluations(episodes: Mapping[int, Sized]) -> list[int]:

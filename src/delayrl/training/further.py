@@ -127,9 +127,9 @@ def _check(run: RunFolder, config: Mapping[str, Any], first: Mapping[str, Any], 
             checkpoint.check(replay=True)
         except (OSError, DelayRLError) as error:
             raise DelayRLError(f"{run.path} has lost a part of its replay ({error}); {hint}") from error
-    own, others = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))
+    own, firsts = ({**c, "schedule": {**c["schedule"], "steps": steps}} for c in (config, first))
     # a crash may have come between two seeds
     changing = ("seed", "versions", "later_versions", "cost", "origin", "configuration")
-    for name in sorted(own.keys() | others.keys()):
-        if name not in changing and own.get(name) != others.get(name):
+    for name in sorted(own.keys() | firsts.keys()):
+        if name not in changing and own.get(name) != firsts.get(name):
             raise DelayRLError(f"{run.path} has another {name} than the other seeds; train it alone")

@@ -36,7 +36,8 @@ def control_group(name: str) -> str:
 
 def uses_accelerator(device: str | None) -> bool:
     """Whether workers on this device compute elsewhere than on the processor."""
-    return device != "cpu" and bool(entry_points(group="jax_plugins"))
+    chosen = (device, os.environ.get("JAX_PLATFORMS"))
+    return "cpu" not in chosen and bool(entry_points(group="jax_plugins"))
 
 
 def shared(seeds: int, device: str | None) -> str:

@@ -64,7 +64,8 @@ class Recorder:
         keys = jax.vmap(lambda key: jax.random.fold_in(key, step))(group.keys)
         summary = []
         for policy, evaluator in self._evaluators.items():
-            played = evaluator(states[policy], resets, keys, opening if policy == "agent" else None, own)
+            with jax.default_matmul_precision("float32"):  # as `evaluate`, whatever training computes in
+                played = evaluator(states[policy], resets, keys, opening if policy == "agent" else None, own)
             summary.append(f"{policy} {played.returns.mean():.4g}")
             for i, (run, tracker) in enumerate(zip(group.folders, self._trackers, strict=True)):
                 rows = [

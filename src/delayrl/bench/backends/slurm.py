@@ -67,7 +67,7 @@ def script(
     source = grid.name if grid.is_shipped else str(grid.source.resolve())
     words = [sys.executable, "-m", "delayrl", "bench", "run", source, "--runs", str(runs.resolve()), *arguments]
     limit = 3600 if time_limit is None else time_limit
-    words += ["--time-limit", f"{int(limit)}s"]
+    words += ["--time-limit", f"{math.ceil(limit)}s"]
     before = int(GRACE) + 30
     for option in options:
         if not option.startswith("-") or "\n" in option:

@@ -101,7 +101,8 @@ class History:
             The step of the observation; its age, which is the number of steps from there to the step of the command;
             and the actions of these steps, oldest first: fewer than the age if the oldest are no longer remembered.
         """
-        gap, added = self._gap(now, elapsed), self._begins_up_to(now, elapsed)
+        gap = self._gap(now, elapsed)
+        added = self._begins_up_to(now, gap)
         begins, actions = [*self._begins, *added], [*self._actions, *[self._uncommanded()] * (len(added) - 1)]
         if gap == 0:
             actions = actions[:-1]
@@ -119,7 +120,8 @@ class History:
 
     def record(self, action: Action, now: float, elapsed: int) -> None:
         """Add a command given at `now`, and the steps without a command before it."""
-        gap, added = self._gap(now, elapsed), self._begins_up_to(now, elapsed)
+        gap = self._gap(now, elapsed)
+        added = self._begins_up_to(now, gap)
         if gap == 0:
             self._actions[-1] = action
             self._counts["replaced"] += 1
@@ -148,9 +150,9 @@ class History:
             return elapsed + self.lead + 1
         return math.floor((now + self.lead * self._period - self._begins[-1]) / self._period + 0.5)
 
-    def _begins_up_to(self, now: float, elapsed: int) -> list[float]:
-        """Return when the steps after the newest begin, up to that of a command at `now`; long gaps are cut."""
-        begin, gap = now + self.lead * self._period, self._gap(now, elapsed)
+    def _begins_up_to(self, now: float, gap: int) -> list[float]:
+        """Return when the `gap` steps after the newest begin, up to that of a command at `now`; long gaps are cut."""
+        begin = now + self.lead * self._period
         uncommanded = min(gap - 1, self._capacity)
         if uncommanded < 0:
             return []
