@@ -49,20 +49,6 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Any:
     return SimpleNamespace(started=started, rows=rows, tracked=tracked, given=given)
 
 
-def test_evaluations_compute_in_float32(played: Any) -> None:
-    made, asked = played.started("corrected"), []
-
-    def play(*args: Any) -> Episodes:
-        asked.append(jax.default_matmul_precision.value)
-        return Episodes(RETURNS, LENGTHS)
-
-    made._evaluators = {"agent": play}
-    with jax.default_matmul_precision("bfloat16"):
-        made.evaluate(100, STATE)
-        asked.append(jax.default_matmul_precision.value)
-    assert asked == ["float32", "bfloat16"]
-
-
 def test_rows_are_of_their_seed_and_episode(played: Any) -> None:
     played.started("corrected").evaluate(100, STATE)
     found = [(r["seed"], r["step"], r["episode"], r["return"], r["length"], r["reset_seed"]) for r in played.rows]

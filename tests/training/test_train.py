@@ -90,13 +90,14 @@ def test_first_update_of_an_agent_that_sees_the_true_state(tmp_path: Path) -> No
     ],
 )
 def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, monkeypatch) -> None:
-    """As it is lowered for a GPU: learning, acting and evaluating, in one process after runs of other precisions."""
+    """As it is lowered for a GPU, in one process after runs of other precisions; evaluating is in float32."""
     lowered: list[str] = []
+    evaluated: list[str] = []
     learn, act, played = Program.learn, Program.act, Evaluator.__call__
 
-    def products(function, *args, **options) -> None:
+    def products(function, *args, to=lowered, **options) -> None:
         text = function.trace(*args, **options).lower(lowering_platforms=("cuda",)).as_text()
-        lowered.extend(line for line in text.splitlines() if "dot_general" in line)
+        to.extend(line for line in text.splitlines() if "dot_general" in line)
 
     def learning(self, learner, pending, keys, last, random_steps):
         hidden = np.stack([stored.hidden for stored in pending[-1]])
@@ -112,7 +113,7 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
         inner = self._act
 
         def watched(*args):
-            products(inner, *args) if int(args[-1]) == 0 else None
+            products(inner, *args, to=evaluated) if int(args[-1]) == 0 else None
             return inner(*args)
 
         monkeypatch.setattr(self, "_act", watched)
@@ -126,8 +127,10 @@ def test_precision_of_every_product(precision: str, words: str, tmp_path: Path, 
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     run = train("bpql", tmp_path / "run", steps=101, precision=precision, hidden=[FEW, FEW])
     assert len(run.rows()) == 4
-    assert len(lowered) > 30
+    assert len(lowered) > 25
     assert all(words in line for line in lowered)
+    assert len(evaluated) > 5
+    assert all("precision = [HIGHEST, HIGHEST]" in line for line in evaluated)
 
 
 def test_blocks_end_at_evaluations(tmp_path: Path) -> None:
