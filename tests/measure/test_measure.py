@@ -300,6 +300,20 @@ def test_pushes_stay_within_a_space_of_one_bound(low: float, high: float) -> Non
     assert delays(Careful())[2] == [0]
 
 
+@pytest.mark.parametrize(("low", "high"), [(-100, np.inf), (-np.inf, 1000), (-np.inf, np.inf)])
+def test_a_far_bound_moves_no_push(low: float, high: float) -> None:
+    class Watched(Hidden):
+        action_space, most = Box(low, high, (1,), np.float32), 0.0
+
+        def step(self, action):
+            self.most = max(self.most, float(np.abs(action).max()))
+            return super().step(action)
+
+    env = Watched()
+    probe(env, episodes=1)
+    assert 0 < env.most <= 1
+
+
 def test_needs_only_numpy_and_gymnasium() -> None:
     heavy = {"jax", "matplotlib", "mujoco", "pyarrow"}
     code = f"import sys, delayrl.measure; print({heavy} & set(sys.modules))"

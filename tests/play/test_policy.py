@@ -81,7 +81,7 @@ def test_policy_refuses_what_it_does_not_know(vdpo: Run) -> None:
         with pytest.raises(delayrl.DelayRLError, match=r"the info that `Delayed` gives: it has no age and actions"):
             policy.act(obs, info)
     for age in (2.7, None, "2"):
-        with pytest.raises(delayrl.DelayRLError, match="an age counts whole steps"):
+        with pytest.raises(delayrl.DelayRLError, match="an age is an integer"):
             policy.act(obs, {"age": age, "actions": actions})
     with pytest.raises(delayrl.DelayRLError, match="arrays of numbers"):
         policy.act(obs, {"age": 2, "actions": [[0, 0], [0]]})

@@ -147,7 +147,7 @@ def export_layers(
     Args:
         layers: the weights [inputs, outputs] and biases of each layer. The MLP has ReLU between them and a tanh at the
             end, and -1 .. 1 is the range of the actions.
-        function: the policy, as for `adapt`. The layers are compared with it on random inputs of every age.
+        function: the policy, as for `adapt`. The layers are compared with it on 200 random inputs, of ages 0 to Δ.
         env: the environment that it was trained in, with an `AugmentedObservation`.
         out: a new or empty folder.
         agent: the name that the bundle gives.

@@ -151,9 +151,10 @@ def first(effect: Array) -> Array:
 
 
 def _bounds(env: Env) -> tuple[Array, Array]:
-    """Return the bounds of the actions, [A] each; a missing one lies 2 from the other, ±1 where both miss."""
+    """Return the bounds of the actions, [A] each; ±1 where one is missing, moved into the space."""
     space: Any = env.action_space
     low, high = space.low.astype(float), space.high.astype(float)
     has_low, has_high = np.abs(low) < 1e6, np.abs(high) < 1e6
-    least = np.where(has_low, low, np.where(has_high, high - 2, -1.0))
-    return least, np.where(has_high, high, np.where(has_low, low + 2, 1.0))
+    moved = np.maximum(np.minimum(np.where(has_high, high - 2, -1.0), -1.0), np.where(has_low, low, -np.inf))
+    both = has_low & has_high
+    return np.where(both, low, moved), np.where(both, high, moved + 2)

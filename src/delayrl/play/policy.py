@@ -80,15 +80,15 @@ class Policy:
                 `Delayed` puts there. Entries after the first `age` are ignored.
 
         Raises:
-            DelayRLError: wrong sizes, numbers that are not finite, no age or actions, or an age that the policy was not
-                trained for.
+            DelayRLError: wrong sizes, numbers that are not real or not finite, no age or actions, an age that is no
+                integer, or one that the policy was not trained for.
         """
         if not {"age", "actions"} <= info.keys():
             raise DelayRLError("the policy needs the info that `Delayed` gives: it has no age and actions here")
         try:
             age = operator.index(info["age"])
         except TypeError:
-            raise DelayRLError(f"an age counts whole steps; got {info['age']!r}") from None
+            raise DelayRLError(f"an age is an integer, the number of whole steps; got {info['age']!r}") from None
         try:
             obs, actions = np.asarray(obs), np.asarray(info["actions"])
         except ValueError:  # rows of several lengths

@@ -51,7 +51,7 @@ def go_on(
         progress: as `train`.
 
     Returns:
-        The run, or the list of runs if the folder is that of several.
+        The run, or the list of runs if the folder is not a run but holds those of seeds.
 
     Raises:
         DelayRLError: no run, fewer steps than it has, a run whose replay is gone, and what `train` raises.

@@ -36,8 +36,8 @@ def control_group(name: str) -> str:
 
 def uses_accelerator(device: str | None) -> bool:
     """Whether workers on this device compute elsewhere than on the processor."""
-    chosen = (device, os.environ.get("JAX_PLATFORMS"))
-    return "cpu" not in chosen and bool(entry_points(group="jax_plugins"))
+    chosen = device or os.environ.get("JAX_PLATFORMS")
+    return chosen != "cpu" and bool(entry_points(group="jax_plugins"))
 
 
 def shared(seeds: int, device: str | None) -> str:
