@@ -199,12 +199,12 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
 
 def draw(arms: list[Result], out: Path) -> None:
     """Draw the curves of the arms in one picture."""
-    figure, axes = pyplot.subplots(figsize=(8, 4.4), layout="constrained")
+    figure, axes = pyplot.subplots(figsize=(8, 6), layout="constrained")
     colours = [to_hex(pyplot.get_cmap("tab20")(number)) for number in range(20)]
     for result, colour in zip(arms, itertools.cycle(colours)):
         curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
     axes.set_title("HalfCheetah-v5, 25 steps late unless said")
     axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
-    axes.legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)
