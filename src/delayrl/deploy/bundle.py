@@ -1,6 +1,5 @@
 """The policy of a bundle: `load_bundle` reads and checks the files, `Bundle` acts."""
 
-import operator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from delayrl.deploy.backends.numpy_policy import numpy_policy
 from delayrl.deploy.files import WEIGHTS, check_files, read_files
 from delayrl.deploy.runtime.episode import LONGEST_STEP, SHORTEST_STEP
 from delayrl.errors import DelayRLError, one_line
+from delayrl.run.arrays import age_of
 
 BACKENDS = ("numpy", "onnx", "jax")
 
@@ -63,10 +63,7 @@ class Bundle:
         Raises:
             DelayRLError: wrong sizes, an age beyond those of training, or numbers that are not finite.
         """
-        try:
-            age = operator.index(age)
-        except TypeError:
-            raise DelayRLError(f"an age counts whole steps; got {age!r}") from None
+        age = age_of(age, self.max_age)
         try:
             with np.errstate(over="ignore"):  # overflow gives infinity, which is refused below
                 obs, actions = np.asarray(obs, np.float32), np.asarray(actions, np.float32)
@@ -77,8 +74,6 @@ class Bundle:
         shape = (self.max_age, self.action_size)
         if actions.shape != shape:
             raise DelayRLError(f"the policy takes an action history of shape {shape}; got {actions.shape}")
-        if not 0 <= age <= self.max_age:
-            raise DelayRLError(f"the policy takes ages 0..{self.max_age}; got {age}")
         if not (np.isfinite(obs).all() and np.isfinite(actions[:age]).all()):
             raise DelayRLError("the policy was given an observation or an action that is not a finite number")
         with np.errstate(all="ignore"):

@@ -1,6 +1,5 @@
 """Trained policies: `load` a run, then `act` on what the wrapper shows."""
 
-import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +17,7 @@ from delayrl.envs.making import make
 from delayrl.envs.task import Task, TaskLike, closing, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, agent_of, warn_of_other_code
-from delayrl.run.arrays import inner_range, restore_tree
+from delayrl.run.arrays import age_of, inner_range, restore_tree
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder, RunLike, path_of
 
@@ -85,10 +84,7 @@ class Policy:
         """
         if not {"age", "actions"} <= info.keys():
             raise DelayRLError("the policy needs the info that `Delayed` gives: it has no age and actions here")
-        try:
-            age = operator.index(info["age"])
-        except TypeError:
-            raise DelayRLError(f"an age is an integer, the number of whole steps; got {info['age']!r}") from None
+        age = age_of(info["age"], self.spec.delay)
         try:
             obs, actions = np.asarray(obs), np.asarray(info["actions"])
         except ValueError:  # rows of several lengths
@@ -97,8 +93,6 @@ class Policy:
             raise DelayRLError(f"the policy takes real numbers; got {obs.dtype} and actions of {actions.dtype}")
         if obs.shape != (self.spec.obs_size,):
             raise DelayRLError(f"the policy takes observations of size {self.spec.obs_size}; got shape {obs.shape}")
-        if not 0 <= age <= self.spec.delay:
-            raise DelayRLError(f"the policy takes ages 0..{self.spec.delay}; got {age}")
         actions = actions.reshape(-1, self.spec.action_size) if actions.size == 0 else actions
         if actions.ndim != 2 or actions.shape[1] != self.spec.action_size:
             raise DelayRLError(f"actions are rows of {self.spec.action_size} numbers; got shape {actions.shape}")

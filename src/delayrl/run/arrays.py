@@ -1,6 +1,7 @@
 """Arrays on disk as safetensors, and pytrees as named arrays. Nothing is pickled."""
 
 import hashlib
+import operator
 import re
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,17 @@ def inner_range(low: NDArray[Any], high: NDArray[Any]) -> tuple[NDArray[np.float
     least, largest = np.asarray(low, np.float32), np.asarray(high, np.float32)
     least = np.where(least < low, np.nextafter(least, np.float32(np.inf)), least)
     return least, np.where(largest > high, np.nextafter(largest, np.float32(-np.inf)), largest)
+
+
+def age_of(given: Any, longest: int) -> int:
+    """Return an age as a number of steps. Raises DelayRLError if it is no integer, or not in 0..longest."""
+    try:
+        age = operator.index(given)
+    except TypeError:
+        raise DelayRLError(f"an age is an integer, the number of whole steps; got {given!r}") from None
+    if not 0 <= age <= longest:
+        raise DelayRLError(f"the policy takes ages 0..{longest}; got {age}")
+    return age
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
