@@ -222,6 +222,29 @@ def test_a_forecast_learns_the_change_and_nothing_else(rng: np.random.Generator)
     np.testing.assert_allclose(follow_changes(actor, x, state)["deviation"], np.sqrt(square), rtol=1e-4)
 
 
+def test_in_distances_no_sample_outweighs_the_others(rng: np.random.Generator) -> None:
+    """The error is the root of the squared one, from 0; its gradient at a forecast has nearly the same length."""
+    actor = away_from_start(Spec(OBS, ACT, 3))
+    x = views_of(rng, (6,))
+    state = jnp.asarray(rng.normal(size=(6, OBS)) * 10.0 ** np.arange(6)[:, None], jnp.float32)
+    each = [forecast_loss(actor, x[i], state[i]) for i in range(6)]
+    expected = np.mean([np.sqrt(error + 1e-4) - 1e-2 for error in each])
+    np.testing.assert_allclose(forecast_loss(actor, x, state, "distance"), expected, rtol=1e-5)
+    assert each[0] == each[2] == 0 < each[1] < each[3] / 10 < each[5] / 100  # 0 at age 0
+
+    def error(bias: jax.Array, i: int) -> jax.Array:
+        *layers, last = actor["forecast"]
+        return forecast_loss(actor | {"forecast": [*layers, last | {"b": bias}]}, x[i], state[i], "distance")
+
+    slopes = [jax.grad(error)(actor["forecast"][-1]["b"], i) for i in range(6)]
+    lengths = [float(jnp.linalg.norm(slope)) for slope in slopes]
+    np.testing.assert_allclose(lengths, [0, OBS**-0.5] * 3, rtol=1e-3)
+    agent, windows = replace(FORECASTING, forecast_error="distance"), random_windows(Spec(OBS, ACT, 3))
+    start = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
+    squared, distance = (a.update(start, windows, jax.random.key(1), jnp.int32(4))[0] for a in (FORECASTING, agent))
+    assert not np.allclose(squared.actor["forecast"][0]["w"], distance.actor["forecast"][0]["w"], atol=1e-5)
+
+
 def test_values_may_move_the_forecast() -> None:
     """The first update then moves the policy as before, for it read the same forecast, but the forecast elsewhere."""
     state = FORECASTING.init(Spec(OBS, ACT, 3), jax.random.key(0))
@@ -230,8 +253,9 @@ def test_values_may_move_the_forecast() -> None:
     for a, b in zip(jax.tree.leaves(alone.actor["policy"]), jax.tree.leaves(both.actor["policy"]), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
     assert not np.allclose(alone.actor["forecast"][0]["w"], both.actor["forecast"][0]["w"], atol=1e-5)
-    with pytest.raises(DelayRLError, match=r"forecast_learns_from=states\+values needs encoder=forecast; got mlp"):
-        replace(VALUED, encoder="mlp").for_run(Schedule())
+    for agent in (VALUED, replace(FORECASTING, forecast_error="distance")):
+        with pytest.raises(DelayRLError, match=r"forecast_error=distance need encoder=forecast; got mlp"):
+            replace(agent, encoder="mlp").for_run(Schedule())
 
 
 @pytest.mark.parametrize("pulled", [True, False])

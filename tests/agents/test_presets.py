@@ -16,6 +16,7 @@ ANY_AGE = {
     "pull_end": 0.75,
     "encoder": "forecast",
     "forecast_learns_from": "states",
+    "forecast_error": "squared",
     "encoder_width": 64,
     "encoder_layers": 2,
     "belief_weight": 0.0,

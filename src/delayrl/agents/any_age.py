@@ -25,7 +25,7 @@ from delayrl.agents.base import Deterministic, Phase, Schedule
 from delayrl.agents.lifting import lifting_loss
 from delayrl.agents.sac import State
 from delayrl.core import networks
-from delayrl.core.forecast import follow_changes, forecast_init, forecast_loss, forecasting, held, in_task_units
+from delayrl.core.forecast import Error, follow_changes, forecast_init, forecast_loss, forecasting, held, in_task_units
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import annealed, gaussian_kl, masked_mean
 from delayrl.core.sequence import sequence, sequence_init, tokens
@@ -55,6 +55,7 @@ class AnyAge:
     pull_end: Annotated[float, "part of the run after which the pull's weight is 0", (0.0, 1.0)] = 0.75
     encoder: Annotated[Encoder, "how the actor reads x_t: flat, by a forecast of s_t, or as a sequence"] = "forecast"
     forecast_learns_from: Annotated[LearnsFrom, "what moves the forecast: states, or also values of actions"] = "states"
+    forecast_error: Annotated[Error, "what the forecast minimises: a sample's squared error, or its root"] = "squared"
     encoder_width: Annotated[int, "embedding dimension of the transformer"] = 64
     encoder_layers: Annotated[int, "transformer blocks"] = 2
     belief_weight: Annotated[float, "weight of the transformer's loss for the unseen states", (0.0, 1e6)] = 0.0
@@ -83,8 +84,9 @@ class AnyAge:
             raise DelayRLError("pull_weight needs a younger second_age to pull towards, random or zero; else give 0")
         if self.belief_weight and (self.encoder != "transformer" or self.second_age == "none"):
             raise DelayRLError("belief_weight needs encoder=transformer and a second_age; without them give 0")
-        if self.forecast_learns_from != "states" and self.encoder != "forecast":
-            raise DelayRLError(f"forecast_learns_from=states+values needs encoder=forecast; got {self.encoder}")
+        if (self.forecast_learns_from, self.forecast_error) != ("states", "squared") and self.encoder != "forecast":
+            options = "forecast_learns_from=states+values and forecast_error=distance"
+            raise DelayRLError(f"{options} need encoder=forecast; got {self.encoder}")
         return replace(self, run_steps=schedule.steps)
 
     def init(self, spec: Spec, key: Key) -> State:
@@ -158,7 +160,7 @@ class AnyAge:
             if self.pull_weight and second is not None:
                 total += weight * self.distance(*(Gaussian(policy.mean[i], policy.log_std[i]) for i in range(2)))
             if self.encoder == "forecast":
-                total += forecast_loss(actor, x, states)
+                total += forecast_loss(actor, x, states, self.forecast_error)
             if self.belief_weight:
                 total += self.belief_weight * belief_loss(actor, actor_input, windows)
             return total

@@ -1,5 +1,7 @@
 """A policy network that reads a forecast of s_t: an MLP on x_t for the change since the observation, and one to act."""
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,10 +10,13 @@ from delayrl.core.networks import Params, mlp, mlp_init
 from delayrl.core.types import Key, Spec
 from delayrl.core.views import input_size
 
+Error = Literal["squared", "distance"]
 RATE = 0.01
 """Rate at which the deviations of the changes follow a batch's."""
 LEAST_DEVIATION = 1e-2
 """So that an entry that hardly changes is not blown up."""
+ROUNDING = 1e-2
+"""Radius, in deviations, within which a distance is nearly a square, so that it has a gradient at 0."""
 
 
 def forecast_init(key: Key, spec: Spec, hidden: tuple[int, ...], outputs: int) -> Params:
@@ -41,10 +46,16 @@ def held(params: Params) -> Params:
     return params | {"forecast": jax.lax.stop_gradient(params["forecast"])}
 
 
-def forecast_loss(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Array:
-    """Return the mean squared error of the change from the observation in x_t to s_t, in deviations."""
+def forecast_loss(
+    params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"], error: Error = "squared"
+) -> Array:
+    """Return the mean error of the change from the observation in x_t to s_t, in deviations.
+
+    The error of a sample is the mean of its entries' squared errors, or the root of that, which is a distance.
+    """
     change = _change(x, state) / jax.lax.stop_gradient(params["deviation"])
-    return (jnp.where(_late(x), mlp(params["forecast"], x) - change, 0) ** 2).mean()
+    squares = (jnp.where(_late(x), mlp(params["forecast"], x) - change, 0) ** 2).mean(-1)
+    return (squares if error == "squared" else jnp.sqrt(squares + ROUNDING**2) - ROUNDING).mean()
 
 
 def follow_changes(params: Params, x: Float[Array, "*batch input"], state: Float[Array, "*batch obs"]) -> Params:

@@ -14,6 +14,7 @@ OLDER: Mapping[str, Any] = {
     "pull": "moments",
     "encoder": "mlp",
     "forecast_learns_from": "states",
+    "forecast_error": "squared",
     "encoder_width": 64,
     "encoder_layers": 2,
     "belief_weight": 0.0,
