@@ -23,6 +23,7 @@ VARIANTS = (
     PLAIN,
     "`any-age`, `encoder=mlp`",
     "`any-age`, `forecast_learns_from=states+values`",
+    "`any-age`, `forecast_error=distance`",
     "`bpql`, `batch_size=128`",
 )
 """Shown beside the arms of the first page."""

@@ -36,6 +36,7 @@ COLOURS = {
     "`sac`, no delay": "#8c8c8c",
     "`sac`, no delay, `critic_norm=layer`": "#c4c4c4",
     "`any-age`": "#8250df",
+    "`any-age`, `forecast_error=distance`": "#d2a8ff",
     "`vdpo` †": "#1f6feb",
     "`lifting`": "#bc4c00",
     "`bpql`": "#1a7f37",
@@ -109,10 +110,11 @@ def in_words(condition: Condition, privileged: bool) -> str:
 
 
 def table(chosen: Chosen, marked: Collection[tuple[str, Case]] = ()) -> str:
-    """Return a Markdown table: a row for each arm, with ° where it is `marked`."""
+    """Return a Markdown table: a row for each arm, with ° where it is `marked`; a variant at least after its agent."""
 
-    def rank(label: str) -> float:
-        return -chosen[label, CASES[1]].curves.final.mean() if (label, CASES[1]) in chosen else np.inf
+    def rank(label: str) -> tuple[float, str]:
+        known = [arm for arm in (label, label.partition(",")[0]) if (arm, CASES[1]) in chosen]
+        return -chosen[known[0], CASES[1]].curves.final.mean() if known else np.inf, label
 
     head = ["", *(f"{short(env)}, Δ = {delay}" for env, delay in CASES)]
     labels = sorted(dict.fromkeys(label for label, _ in chosen), key=rank)
@@ -143,6 +145,6 @@ def draw(chosen: Chosen, out: Path) -> None:
         axes.locator_params(axis="x", nbins=4)
     labels = [label for label in COLOURS if label in lines]
     names = [label.replace("`", "") for label in labels]
-    figure.legend([lines[label] for label in labels], names, loc="outside lower center", ncols=5, frameon=False)
+    figure.legend([lines[label] for label in labels], names, loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)
