@@ -269,8 +269,9 @@ BAD = [
     (BASIC + "[overrides.bpql]\nsteps = 9\n[[product]]\n[product.overrides]\nbpql = 3\n", "a table in one place"),
     (BASIC + 'preset = "big"\n', "is not a valid TOML file"),  # twice
     (BASIC.replace("small", "big"), "unknown preset 'big'"),
-    (BASIC.replace('"bpql"', '"a-sac"'), "two cells hold the same run"),
+    (BASIC.replace('"bpql"', '"a-sac"'), "a cell is in the grid twice, a-sac on"),
     (BASIC + "[[product]]\n[[product]]\nseeds = [1, 2]\n", "two cells hold the same run"),
+    (BASIC.replace("[2, 3]", '[2, "2"]'), "listed twice, perhaps written in two ways"),
     (BASIC + "[[product]]\nsteps = 3\n", "product 1: unknown key 'steps'"),
     (BASIC + 'include = ["nowhere.toml"]\n', "there is no grid file"),
     (BASIC + 'include = ["papertable"]\n', "unknown grid 'papertable'"),

@@ -162,11 +162,20 @@ def test_bad_tables(finished, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match=gone):
         collect(replace(grid, cells=grid.cells[1:]), runs, file)
     assert file.read_bytes() == before
+    other = replace(grid, cells=[replace(grid.cells[1], id="0123")])
+    with pytest.raises(delayrl.DelayRLError, match=r"give another --out$"):  # no cell is left to take from it
+        collect(other, runs, file)
+    with pytest.raises(delayrl.DelayRLError, match="has no cell of mixed: it is the table of an earlier version of it"):
+        collect(other, runs, tmp_path / "new.sqlite", [file])
+    with pytest.raises(delayrl.DelayRLError, match=r"is a folder; give a file, such as .*/mixed\.sqlite"):
+        collect(grid, runs, tmp_path)
     with pytest.raises(delayrl.DelayRLError, match="there is no table"):
         collect(grid, runs, file, [tmp_path / "nowhere.sqlite"])
     with pytest.raises(delayrl.DelayRLError, match="has no cell of mixed: it is the table of 'first'"):
         collect(grid, runs, file, [BENCHMARKS / "results" / "first.sqlite"])
-    with pytest.raises(delayrl.DelayRLError, match="has no rows"):
+    with pytest.raises(
+        delayrl.DelayRLError, match=r"has no rows .* `delayrl bench run .*\.toml --runs .*elsewhere` makes"
+    ):
         collect(grid, tmp_path / "elsewhere", tmp_path / "none.sqlite")
     assert not (tmp_path / "none.sqlite").exists()
 
@@ -178,12 +187,20 @@ def test_what_is_collected_stays(finished, tmp_path: Path) -> None:
     shutil.copytree(runs, part)
     rows = part / grid.cells[0].folder / "seed1" / "rows.jsonl"
     rows.write_text("".join(rows.read_text().splitlines(keepends=True)[:2]))
-    assert collect(grid, part, file) == 6
+    with pytest.raises(delayrl.DelayRLError, match="seed1 ended, but rows of the last evaluation are missing"):
+        collect(grid, part, file)
     assert collect(grid, runs, file) == 8
     whole = file.read_bytes()
     for folder in (part, tmp_path / "gone", runs):
         assert collect(grid, folder, file) == 8
         assert file.read_bytes() == whole
+    less = changed(file, "DELETE FROM rows WHERE step = 60 AND run = (SELECT id FROM runs WHERE seed = 1)")
+    assert len(read_table(less).rows) == 6
+    assert collect(grid, runs, less) == 8
+    assert less.read_bytes() == whole
+    (part / grid.cells[0].folder / "seed0" / "config.json").unlink()
+    with pytest.raises(delayrl.DelayRLError, match=r"seed0 has lost its config\.json: move it out of that folder"):
+        collect(grid, part, file)
 
 
 def changed(file: Path, query: str) -> Path:

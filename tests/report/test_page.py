@@ -248,7 +248,7 @@ def test_page_begins_with_what_must_be_known(opened: Any) -> None:
     view = opened(summarise(rows(cells, evaluations=2, episodes=1), cells), description=f"Wide or not {EVIL}.")
     assert view.locator("#head p").all_inner_texts()[1:] == [
         f"Wide or not {EVIL}.",
-        "Returns on Ant are not normalised: the random policy has no rows of this protocol, preset and length.",
+        "Returns on Ant are not normalised: the random policy has no rows of this protocol.",
         "Overridden in all cells of bpql: width=8.",
     ]
 

@@ -305,14 +305,14 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"replay_capacity": 5}, "at least"),
         (
             {"steps": 99},
-            "the first update is at step 100, and the run ends at step 99; give more steps, fewer random_steps$",
+            "the first update is at step 100, and the run ends at step 99; give more steps, or fewer random_steps$",
         ),
         ({"steps": 100, "update_every": 101, "clone_every": 102}, "the first update is at step 101"),
         (
             {"steps": 250, "clone_every": 251},
             "a part would learn nothing: its first update is at step 251, and the run",
         ),
-        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, a smaller update_after$"),
+        ({"steps": 200, "update_after": 201}, "ends at step 200; give more steps, or a smaller update_after$"),
         ({"log_std_range": [2.0, -20.0]}, "log_std_range is LOW HIGH, with LOW below HIGH; got 2.0, -20.0"),
         ({"track": "paper"}, "tensorboard or wandb"),
     ],

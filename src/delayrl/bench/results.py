@@ -48,9 +48,11 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 
 
 def _own_rows(cell: Cell, path: Path) -> list[Row]:
-    """Return the rows of a cell's run. Raises DelayRLError if it was trained further than the cell."""
+    """Return the rows of a cell's run. Raises DelayRLError if it was trained further than the cell, or is damaged."""
     run, steps = RunFolder(path), cell.condition.steps
     rows = name_configuration(run.read("rows"))
+    if rows and not run.exists:
+        raise DelayRLError(f"{path} has lost its config.json: move it out of that folder, and run the cell again")
     if rows and (trained := run.config["schedule"]["steps"]) != steps:
         line = f"{path} was trained for {trained:,} steps, and its cell for {steps:,}"
         raise DelayRLError(f"{line}: move it out of that folder, and run the cell again")
@@ -88,7 +90,10 @@ def collect(grid: Grid, runs: Path, out: Path, others: Sequence[Path] = ()) -> i
             grid, `out` is being written, is the table of another grid, or has rows of cells that the grid has no more.
     """
     if not others and not out.exists() and next(rows_of(grid.cells, runs), None) is None:
-        raise DelayRLError(f"{grid.name} has no rows below {runs} yet; `delayrl bench run {grid.name}` makes them")
+        made = f"`delayrl bench run {grid.name if grid.is_shipped else grid.source} --runs {runs}` makes them"
+        raise DelayRLError(f"{grid.name} has no rows below {runs} yet; {made}")
+    if out.is_dir():
+        raise DelayRLError(f"{out} is a folder; give a file, such as {out / grid.name}.sqlite")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with lock(out.parent) as free:
@@ -118,10 +123,14 @@ def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path,
         if file == out and gone:
             words = f"{out} has rows of {count(len(gone), 'cell')} that {grid.name} has no more ({', '.join(gone[:3])}"
             words += ", …)" if gone[3:] else ")"
-            raise DelayRLError(f"{words}; give another --out, and --also {out} for the cells that it still has")
+            words += "; give another --out"
+            raise DelayRLError(
+                f"{words}, and --also {out} for the cells that it still has" if ids & set(known) else words
+            )
         held[file] = {id: known[id] for id in ids & known.keys()}
         if not held[file]:
-            raise DelayRLError(f"{file} has no cell of {grid.name}: it is the table of {name!r}")
+            whose = "an earlier version of it" if name == grid.name else f"{name!r}"
+            raise DelayRLError(f"{file} has no cell of {grid.name}: it is the table of {whose}")
     return held
 
 
@@ -142,11 +151,19 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
         if elsewhere and (best[:2] > here[:2] or (best > here and not begun)):
             total += _copy_cell(table, elsewhere, cell, number)
             continue
+        if p.state == "done" and (cut := [str(path) for path, _, rows in found if _last(rows) < cell.condition.steps]):
+            line = f"{', '.join(cut)} ended, but rows of the last evaluation are missing"
+            raise DelayRLError(f"{line}: move {runs / cell.folder} elsewhere, and run the cell again")
         _insert_cell(table, cell, number, p)
         total += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)
     table.commit()
     table.execute("VACUUM")
     return total
+
+
+def _last(rows: Sequence[Row]) -> int:
+    """Return the step of the last evaluation."""
+    return max((row["step"] for row in rows), default=0)
 
 
 def cells_done(file: Path) -> int:

@@ -247,8 +247,9 @@ def raw(summary: Summary) -> list[str]:
             continue
         why = f"SAC without a delay ({number(reference)}) is not better than the random policy ({number(random)})"
         if math.isnan(random) or math.isnan(reference):
-            lacks = "the random policy" if math.isnan(random) else "SAC without a delay"
-            why = f"{lacks} has no rows of this protocol, preset and length"
+            why = "SAC without a delay has no rows of this protocol, preset and length"
+            if math.isnan(random):
+                why = "the random policy has no rows of this protocol"
         tasks.setdefault(why, []).append(result.place.env)
     return [f"Returns on {', '.join(dict.fromkeys(own))} are not normalised: {why}." for why, own in tasks.items()]
 

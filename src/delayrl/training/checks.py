@@ -80,7 +80,7 @@ def check_fit(setup: Setup, env: Delayed) -> None:
         raise DelayRLError(f"{line} {schedule.steps:,}; give more steps, or let it learn more often")
     if (first := min(firsts, default=0)) > schedule.steps:
         start = "a smaller update_after" if schedule.update_after else "fewer random_steps"
-        start += "" if setup.condition.preset == "small" else ", or preset small"
+        start = f"or {start}" if setup.condition.preset == "small" else f"{start}, or preset small"
         line = f"nothing would be learned: the first update is at step {first:,}, and the run ends"
         raise DelayRLError(f"{line} at step {schedule.steps:,}; give more steps, {start}")
     every, block = schedule.evaluate_every, schedule.updates_per_call
