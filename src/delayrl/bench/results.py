@@ -52,10 +52,10 @@ def _own_rows(cell: Cell, path: Path) -> list[Row]:
     run, steps = RunFolder(path), cell.condition.steps
     rows = name_configuration(run.read("rows"))
     if rows and not run.exists:
-        raise DelayRLError(f"{path} has lost its config.json: move it out of that folder, and run the cell again")
+        raise DelayRLError(f"{path} has lost its config.json: {_again(path.parent)}")
     if rows and (trained := run.config["schedule"]["steps"]) != steps:
         line = f"{path} was trained for {trained:,} steps, and its cell for {steps:,}"
-        raise DelayRLError(f"{line}: move it out of that folder, and run the cell again")
+        raise DelayRLError(f"{line}: {_again(path.parent)}")
     return rows
 
 
@@ -153,7 +153,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
             continue
         if p.state == "done" and (cut := [str(path) for path, _, rows in found if _last(rows) < cell.condition.steps]):
             line = f"{', '.join(cut)} ended, but rows of the last evaluation are missing"
-            raise DelayRLError(f"{line}: move {runs / cell.folder} elsewhere, and run the cell again")
+            raise DelayRLError(f"{line}: {_again(runs / cell.folder)}")
         _insert_cell(table, cell, number, p)
         total += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)
     table.commit()
@@ -161,8 +161,13 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
     return total
 
 
+def _again(folder: Path) -> str:
+    """Write how to get a cell with a damaged run: its seeds begin together."""
+    return f"move {folder} elsewhere, and run the cell again"
+
+
 def _last(rows: Sequence[Row]) -> int:
-    """Return the step of the last evaluation."""
+    """Return the step of the last evaluation; what may be missing before it is not looked for."""
     return max((row["step"] for row in rows), default=0)
 
 
