@@ -246,11 +246,12 @@ def _check_overlap(cells: list[Planned]) -> None:
         configuration = setup.cell_id(())
         for seed in cell.seeds:
             other = first.setdefault((configuration, seed), cell)
-            if other is not cell and other.id == cell.id:
-                twice = (
-                    "products overlap (an override that is the default changes nothing), or an agent, task or delay "
+            if other is cell:
+                continue
+            if other.id == cell.id:
+                raise DelayRLError(
+                    f"a cell is in the grid twice, {cell} ({cell.id}): products overlap (an override that is the "
+                    "default changes nothing), or an agent, task or delay is listed twice, perhaps written in two "
+                    "ways, or included again"
                 )
-                twice += "is listed twice, perhaps written in two ways, or included again"
-                raise DelayRLError(f"a cell is in the grid twice, {cell} ({cell.id}): {twice}")
-            if other is not cell:
-                raise DelayRLError(f"two cells hold the same run: {cell} ({cell.id}) and {other} ({other.id})")
+            raise DelayRLError(f"two cells hold the same run: {cell} ({cell.id}) and {other} ({other.id})")

@@ -123,10 +123,8 @@ def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path,
         if file == out and gone:
             words = f"{out} has rows of {count(len(gone), 'cell')} that {grid.name} has no more ({', '.join(gone[:3])}"
             words += ", …)" if gone[3:] else ")"
-            words += "; give another --out"
-            raise DelayRLError(
-                f"{words}, and --also {out} for the cells that it still has" if ids & set(known) else words
-            )
+            kept = f", and --also {out} for the cells that it still has" if ids & known.keys() else ""
+            raise DelayRLError(f"{words}; give another --out{kept}")
         held[file] = {id: known[id] for id in ids & known.keys()}
         if not held[file]:
             whose = "an earlier version of it" if name == grid.name else f"{name!r}"
