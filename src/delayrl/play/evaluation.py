@@ -4,7 +4,7 @@ import contextlib
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,34 @@ class Episodes(NamedTuple):
 
     returns: NDArray[np.float64]
     lengths: NDArray[np.int64]
+
+
+class Evaluation(TypedDict):
+    """What a policy returned in evaluation: a dictionary with these names, which JSON can hold."""
+
+    agent: str
+    """The agent that trained it."""
+    env: str
+    """The task that was played."""
+    delay: int | str
+    """The delay that it was played under."""
+    step: int | None
+    """The step of its training; None for a policy that does not say it."""
+    episodes: int
+    """How many were played."""
+    mean_return: float
+    """The mean of `returns`."""
+    std_return: float | None
+    """Their standard deviation, with n - 1 in the denominator; None for one episode."""
+    returns: list[float]
+    """The undiscounted return of each episode."""
+
+
+class AgeEvaluation(Evaluation):
+    """An evaluation under one constant delay of a sweep over all ages."""
+
+    learned: bool
+    """Whether the policy learned that age, after the start of an episode."""
 
 
 class Evaluator:
@@ -163,7 +191,7 @@ def evaluate(
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     agent: AgentLike | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Play the policy of a run on start states that it never saw.
 
     Args:
@@ -174,10 +202,6 @@ def evaluate(
         env: what makes the environment, as `load`.
         env_kwargs: keyword arguments of it, as `load`.
         agent: as `load`.
-
-    Returns:
-        agent, env, delay, step (of the training; None for a policy that does not say it), episodes, mean_return,
-        std_return (n - 1 in its denominator; None for one episode), returns.
 
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
@@ -199,7 +223,7 @@ def sweep(
     env: TaskLike | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     agent: AgentLike | None = None,
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[AgeEvaluation]:
     """Evaluate a run, or a policy, at every constant delay from 0 to the longest age that its policy was trained for.
 
     Args:
@@ -210,15 +234,12 @@ def sweep(
         env_kwargs: as `evaluate`.
         agent: as `evaluate`.
 
-    Yields:
-        What `evaluate` returns, and `learned`: whether the policy learned that age, after the start of an episode.
-
     Raises:
         DelayRLError: as `evaluate`.
     """
     policy, task = _loaded(run, env, env_kwargs, agent)
     for delay in range(policy.spec.delay + 1):
-        yield _play(policy, task, delay, episodes, seed) | {"learned": delay >= policy.min_age}
+        yield {**_play(policy, task, delay, episodes, seed), "learned": delay >= policy.min_age}
 
 
 def _loaded(
@@ -235,7 +256,7 @@ def _loaded(
     return run, as_task(task, env_kwargs)
 
 
-def _play(policy: Policy, task: Task, delay: DelayLike, episodes: int, seed: int) -> dict[str, Any]:
+def _play(policy: Policy, task: Task, delay: DelayLike, episodes: int, seed: int) -> Evaluation:
     if not isinstance(episodes, int | np.integer) or episodes < 1:
         raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
     check_seed(seed)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from delayrl.play.run import Run
 from delayrl.run.disk import write_figure
 from delayrl.run.rows import plain_text
+
+if TYPE_CHECKING:  # it takes JAX, and curves do not
+    from delayrl.play.evaluation import AgeEvaluation
 
 Line = tuple[str, NDArray[Any], NDArray[Any]]
 
@@ -29,11 +32,11 @@ def curve(run: Run, path: Path) -> None:
         _curves(drawn, path, title, "return", (COLOUR, GREY))
 
 
-def against_delay(results: list[dict[str, Any]], path: Path) -> None:
+def against_delay(results: Sequence["AgeEvaluation"], path: Path) -> None:
     """Draw the returns of one policy against the delay: mean and range of the episodes that `sweep` yields."""
     first = results[0]
     with _axes(path) as axes:
-        _band(axes, [r["delay"] for r in results], [r["returns"] for r in results], COLOUR, first["agent"])
+        _band(axes, [int(r["delay"]) for r in results], [r["returns"] for r in results], COLOUR, first["agent"])
         title = plain_text(f"{first['env']}, one policy, {first['episodes']} episodes a point")
         axes.set(xlabel="delay of the observations (steps)", ylabel="return", title=title)
 
