@@ -3,10 +3,16 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
+
+if TYPE_CHECKING:
+    from delayrl.play.plots import Line
+    from delayrl.play.run import Run
 
 LABELS = "ABCDEFGH"
 ABOUT = ("seed", "versions", "later_versions", "cost", "configuration", "format", "privileged")
@@ -23,49 +29,66 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> None:
     """Print the options that differ and the returns, and draw the learning curves."""
     from delayrl.play.plots import curves
-    from delayrl.play.run import Run
-    from delayrl.report.statistics import FEWEST, area, common_steps, mean_interval
-    from delayrl.run.folder import seed_folders
 
     if not 2 <= len(given.runs) <= len(LABELS):
         raise DelayRLError(f"compare takes two to {len(LABELS)} runs; got {len(given.runs)}")
     if given.out.suffix not in (".png", ".pdf", ".svg"):
         raise DelayRLError(f"--out must end in .png, .pdf or .svg; got {given.out}")
-    groups = [[Run(folder.path) for folder in seed_folders(path)] for path in given.runs]
-    for path, group in zip(given.runs, groups, strict=True):
-        if apart := differences([one.config for one in group]):
-            names = ", ".join(name for name, *_ in apart)
-            raise DelayRLError(f"the seeds in {path} differ in {names}; name runs alone")
+    groups = [_seeds(path) for path in given.runs]
     configs = [group[0].config | {"delay": group[0].delay} for group in groups]
     labels = LABELS[: len(groups)]
     for label, path, group in zip(labels, given.runs, groups, strict=True):
         print(f"{label}  {path}" + (f" ({len(group)} seeds)" if len(group) > 1 else ""))
-    different = differences(configs)
     print()
-    print_table(["option", *labels], different or [["all options", *["the same"] * len(labels)]])
-    rows, drawn = [], []
-    for label, config, group in zip(labels, configs, groups, strict=True):
-        means = [{int(step): float(x.mean()) for step, x in zip(*one.curve(), strict=True)} for one in group]
-        steps, returns = common_steps(means)
-        if not len(steps):
-            raise DelayRLError(f"{group[0].path.parent if len(group) > 1 else group[0].path} has no evaluation yet")
-        drawn.append((f"{label}: {config['agent']}, delay {config['delay']}", steps, returns))
-        cells = [label, f"{int(steps[-1]):,}", len(group)]
-        for values in (returns[:, -1], area(steps, returns)):
-            text = f"{values.mean():,.1f}"
-            if len(group) > 1:
-                low, high = mean_interval(values)
-                text += f" [{low:,.1f}, {high:,.1f}]"
-            cells.append(text)
-        rows.append(cells)
+    print_table(["option", *labels], differences(configs) or [["all options", *["the same"] * len(labels)]])
+    lines = [
+        (f"{label}: {config['agent']}, delay {config['delay']}", *_curve(group))
+        for label, config, group in zip(labels, configs, groups, strict=True)
+    ]
     print()
-    print_table(["", "steps", "seeds", "last return", "mean over training"], rows)
-    if any(len(group) > 1 for group in groups):
-        few = any(1 < len(group) < FEWEST for group in groups)
-        more = f"; with fewer than {FEWEST} it is about their range, and covers less" if few else ""
-        print(f"[low, high]: 95 % bootstrap interval over seeds{more}")
-    curves(drawn, given.out, configs[0]["env"] if len({config["env"] for config in configs}) == 1 else "")
+    _print_returns(labels, lines)
+    curves(lines, given.out, configs[0]["env"] if len({config["env"] for config in configs}) == 1 else "")
     print(f"{given.out}: learning curves")
+
+
+def _seeds(path: Path) -> list["Run"]:
+    """Return the runs of all seeds in a folder. Raises DelayRLError if they differ in more than the seed."""
+    from delayrl.play.run import Run
+    from delayrl.run.folder import seed_folders
+
+    group = [Run(folder.path) for folder in seed_folders(path)]
+    if apart := differences([one.config for one in group]):
+        names = ", ".join(name for name, *_ in apart)
+        raise DelayRLError(f"the seeds in {path} differ in {names}; name runs alone")
+    return group
+
+
+def _curve(group: Sequence["Run"]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return steps that all seeds have, [N], and mean returns, [seeds, N]. Raises DelayRLError if there are none."""
+    from delayrl.report.statistics import common_steps
+
+    means = [{int(step): float(x.mean()) for step, x in zip(*one.curve(), strict=True)} for one in group]
+    steps, returns = common_steps(means)
+    if not len(steps):
+        raise DelayRLError(f"{group[0].path.parent if len(group) > 1 else group[0].path} has no evaluation yet")
+    return steps, returns
+
+
+def _print_returns(labels: str, lines: Sequence["Line"]) -> None:
+    """Print the last and the mean return of each line, with intervals where there are several seeds."""
+    from delayrl.report.statistics import FEWEST, area, mean_interval
+
+    rows = []
+    for label, (_, steps, returns) in zip(labels, lines, strict=True):
+        cells = [label, f"{int(steps[-1]):,}", len(returns)]
+        for values in (returns[:, -1], area(steps, returns)):
+            interval = " [{:,.1f}, {:,.1f}]".format(*mean_interval(values)) if len(values) > 1 else ""
+            cells.append(f"{values.mean():,.1f}{interval}")
+        rows.append(cells)
+    print_table(["", "steps", "seeds", "last return", "mean over training"], rows)
+    if seeds := [len(returns) for _, _, returns in lines if len(returns) > 1]:
+        few = f"; with fewer than {FEWEST} it is about their range, and covers less" if min(seeds) < FEWEST else ""
+        print(f"[low, high]: 95 % bootstrap interval over seeds{few}")
 
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> list[list[Any]]:

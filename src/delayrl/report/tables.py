@@ -3,12 +3,12 @@
 import csv
 import math
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from delayrl.report import statistics
 from delayrl.report.results import PAPER_ORDER, Result, Setting, agent_order, delay_order
@@ -112,21 +112,27 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Ta
     entries = {}
     for (env, delay), label in product(rows, columns):
         result = at.get((env, delay, label))
-        condition = result.condition if result else conditions.get(label)
-        overrides, agent = (condition.overrides, condition.agent) if condition else ({}, label)
-        representation = str(overrides.get("representation", "transformer"))
-        if kind != "ablation" and representation == "transformer":
-            representation = ""  # only values of the ablation name one
-        measure = "steps" if kind == "steps" else "normalised"
-        key = (measure, env.removeprefix("delayrl/"), str(delay), agent, representation)
-        same = overrides.keys() <= SAME_RUN and (result is None or _is_whole(result))  # the paper ran no other variants
-        published = values.get(key) if same else None
+        published = None
+        if result is None or _is_whole(result):
+            condition = result.condition if result else conditions.get(label)
+            overrides, agent = (condition.overrides, condition.agent) if condition else ({}, label)
+            if overrides.keys() <= SAME_RUN:  # the paper ran no other variants
+                published = values.get(_published_key(kind, env, delay, agent, overrides))
         entries[env, delay, label] = _entry(kind, result, published, len(lengths[env, delay]) > 1)
     shown = {place for place, entry in entries.items() if entry != TableEntry()}  # all results are in another table
     plain = {label for label in columns if " " not in label} if kind == "ablation" else set()  # not worth a row there
     rows = [row for row in rows if any((*row, label) in shown for label in columns - plain)]
     columns = {label for label in columns if any((*row, label) in shown for row in rows)}
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
+
+
+def _published_key(kind: Kind, env: str, delay: int | str, agent: str, overrides: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what `published_values` has the paper's value under."""
+    representation = str(overrides.get("representation", "transformer"))
+    if kind != "ablation" and representation == "transformer":
+        representation = ""  # only values of the ablation name one
+    measure = "steps" if kind == "steps" else "normalised"
+    return measure, env.removeprefix("delayrl/"), str(delay), agent, representation
 
 
 def _is_whole(result: Result) -> bool:
