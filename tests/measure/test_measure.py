@@ -23,7 +23,7 @@ from delayrl.cli.measure import _show_environment
 from delayrl.delays import as_delay
 from delayrl.envs.task import quiet
 from delayrl.measure import from_log, probe
-from delayrl.measure.log import rounded_up_steps
+from delayrl.measure.ages import rounded_up_steps
 from delayrl.measure.reading import Table, read_signals
 from delayrl.wrappers import AugmentedObservation, Delayed
 

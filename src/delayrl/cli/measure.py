@@ -13,7 +13,8 @@ from tqdm import tqdm
 from delayrl.cli.console import add_env_kwargs, add_wrappers, seconds, whole
 from delayrl.envs.task import as_task
 from delayrl.errors import DelayRLError, count
-from delayrl.measure.log import Estimated, from_log
+from delayrl.measure.estimated import Estimated
+from delayrl.measure.log import from_log
 from delayrl.measure.plot import plot
 from delayrl.measure.probing import Counts, Probed, probe
 from delayrl.measure.reading import UNITS, doubt

@@ -3,7 +3,7 @@
 Both need only NumPy and Gymnasium. Plots need matplotlib, and Parquet files pyarrow.
 """
 
-from delayrl.measure.log import Estimated as Estimated
+from delayrl.measure.estimated import Estimated as Estimated
 from delayrl.measure.log import from_log as from_log
 from delayrl.measure.probing import Probed as Probed
 from delayrl.measure.probing import probe as probe

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from delayrl.errors import DelayRLError
-from delayrl.measure.log import Estimated
+from delayrl.measure.estimated import Estimated
 
 
 def plot(estimated: Estimated, out: str | Path) -> None:

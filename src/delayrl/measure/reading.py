@@ -16,6 +16,7 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 PREFIXES = {"commands": ("command", "cmd", "action"), "observations": ("observation", "obs")}
 GAP = 20  # rows that may be missing within one recording
 FEWEST, MOST = 0.1, 1000  # rows in a period of control, beyond which one of the two units is doubtful
+WARM_UP = 0.05  # of the log, the part that is left out at its start by default
 SLOW = 2.0  # seconds between rows, beyond which the unit is doubtful
 
 
