@@ -78,7 +78,7 @@ def holm(values: Sequence[float]) -> list[bool]:
     """Return which p-values stay below 5 % after Holm's correction for all of them (Holm, 1979)."""
     clear = [False] * len(values)
     for passed, index in enumerate(np.argsort(values)):
-        if values[index] > 0.05 / (len(values) - passed):
+        if not values[index] <= 0.05 / (len(values) - passed):  # nor is what cannot be known
             break
         clear[index] = True
     return clear
@@ -90,6 +90,8 @@ def ended_at(result: Result) -> str:
 
 
 def bold(text: str) -> str:
-    """Write in bold a difference whose interval leaves out 0."""
+    """Write in bold a difference whose interval leaves out 0; a difference without an interval is empty."""
+    if not text:
+        return ""
     low, high = re.findall(r"[-+][\d,]+", text)[1:]
     return f"**{text}**" if low[0] == high[0] else text

@@ -190,8 +190,10 @@ def ratio(one: statistics.Floats, other: statistics.Floats, result: Result) -> s
 
 
 def paired(one: statistics.Floats, other: statistics.Floats) -> str:
-    """Write the mean difference over the seeds that both have, with its 95 % interval by Student's t."""
+    """Write the mean difference over the seeds that both have, with its 95 % interval by Student's t; empty for one."""
     shared = min(one.size, other.size)
+    if shared < 2:
+        return ""
     gaps = one[:shared] - other[:shared]
     half = stats.t.ppf(0.975, shared - 1) * stats.sem(gaps)
     return f"{gaps.mean():+,.0f} ({gaps.mean() - half:+,.0f} to {gaps.mean() + half:+,.0f})"

@@ -4,11 +4,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
 
 import against  # noqa: E402
+from ladder import paired  # noqa: E402
 from synthetic import row, standing  # noqa: E402
 
 from delayrl.report.summary import summarise  # noqa: E402
@@ -78,3 +80,10 @@ def test_holms_correction(values: list[float], clear: list[bool]) -> None:
 )
 def test_what_leaves_out_0_is_bold(text: str, clear: bool) -> None:
     assert against.bold(text) == (f"**{text}**" if clear else text)
+
+
+def test_what_cannot_be_known_is_not_clear() -> None:
+    """One seed has no interval, and no p-value."""
+    assert against.holm([float("nan"), 1e-9]) == [False, True]
+    assert against.bold("") == ""
+    assert paired(np.array([3.0]), np.array([1.0, 2.0])) == ""

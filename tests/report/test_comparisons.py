@@ -106,8 +106,8 @@ def test_agents_meet_on_the_tasks_that_both_have_ended_on() -> None:
     turned = five.turned()
     assert (turned.one, turned.other, turned.runs) == ("ad-sac", "bpql", (3, 2))
     assert turned.probability.value == pytest.approx(1 - five.probability.value)
-    assert turned.difference[1:] == (-five.difference.high, -five.difference.low)
-    assert turned.turned().difference == five.difference
+    assert np.isnan([*five.difference[1:], *turned.difference[1:]]).all(), "there are fewer than five runs"
+    assert turned.turned().difference.value == five.difference.value
 
 
 def test_interval_of_the_difference_agrees_with_a_bootstrap_written_out() -> None:
@@ -137,6 +137,7 @@ def test_interval_of_the_difference_agrees_with_a_bootstrap_written_out() -> Non
     found = comparisons[None, "bpql", "vdpo"].difference
     ends = s.expanded_percentiles([x.size for pair in finals.values() for x in pair])
     np.testing.assert_allclose(found[1:], np.percentile(drawn, ends), atol=0.02)
+    assert comparisons[None, "bpql", "vdpo"].turned().difference[1:] == (-found.high, -found.low)
     one_anchor = [(np.mean(one) - np.mean(other)) for one, other in finals.values()]
     scales = [110 - 10 / 3, 110 - 10 / 3, 400 - 25 / 3]
     assert found.value == pytest.approx(np.mean(np.array(one_anchor) / scales))

@@ -208,3 +208,7 @@ def test_curves_share_their_steps() -> None:
     steps, curves = s.common_steps([])
     assert steps.size == 0
     assert curves.shape == (0, 0)
+
+
+def test_an_evaluation_at_step_0_alone_has_no_area() -> None:
+    assert np.isnan(s.area([0], [[3.0], [4.0]])).all()

@@ -95,6 +95,18 @@ def test_the_anchors_uncertainty_is_in_the_intervals() -> None:
     assert of(random, "vdpo").final_interval == pytest.approx((40 / 90, 60 / 110))
 
 
+def test_a_variant_of_sac_has_an_interval_and_the_anchors_have_none() -> None:
+    cells, agent = small(), [[0.0, 0, 60], [0.0, 0, 60]]
+    steps = cells["sac"][0].condition.steps
+    layer = standing("sac", "delayrl/Ant-v4", 0, 2, overrides={"critic_norm": "layer"}, id="layer", steps=steps)
+    extra = [row for seed in range(2) for row in curve(layer, seed, [0.0, 0, 50 + 20 * seed])]
+    rows = anchored(cells, vdpo=agent, sac=[[0.0, 0, 110]] * 2, random=[[10.0] * 3] * 2) + extra
+    results = summarise(rows, [*cells.values(), layer]).results.values()
+    intervals = {r.place.label: r.final_interval for r in results if r.is_anchor}
+    assert intervals.pop("sac critic_norm=layer") == pytest.approx((0.4, 0.6))
+    assert np.isnan([*intervals["sac"], *intervals["random"]]).all()
+
+
 def test_steps_to_the_threshold_have_an_interval() -> None:
     """One seed of two reaches it at the second evaluation; the mean and the other never do."""
     cells = small()

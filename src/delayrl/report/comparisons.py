@@ -77,8 +77,8 @@ def _probability(pairs: Sequence[Pair]) -> Estimate:
 
 def _difference(pairs: Sequence[Pair]) -> Estimate:
     value = float(np.mean([one.final.mean() - other.final.mean() for one, other in pairs]))
-    if np.isnan(value):
-        return Estimate(NAN)
+    if np.isnan(value) or min(result.runs for pair in pairs for result in pair) < statistics.FEWEST:
+        return Estimate(value)
     # one pair after the other, those of one task and length together, as their strata are
     pairs = sorted(pairs, key=lambda pair: (pair[0].place.env, pair[0].condition.steps))
     weights = [

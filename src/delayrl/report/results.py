@@ -105,6 +105,11 @@ class Result:
         return statistics.normalised(returns, self.random_anchor.value, self.reference_anchor.value)
 
     @property
+    def as_reference(self) -> str:
+        """How it is named as a reference."""
+        return f"{self.place.label}, no delay"
+
+    @property
     def unfinished(self) -> str:
         """How far it is, if it has not ended; else empty."""
         state = self.progress.state
@@ -121,8 +126,9 @@ class Result:
 
     @cached_property
     def final_interval(self) -> tuple[float, float]:
-        """95 % interval of their mean, with the anchors' uncertainty; NaN where it is unknown."""
-        if not self.runs or np.isnan(self.final).any() or self.is_anchor:
+        """95 % interval of their mean, with the anchors' uncertainty; NaN where it is unknown, and of an anchor."""
+        normalises = self.condition.agent == "random" or self.reference_anchor.source == self.as_reference
+        if not self.runs or np.isnan(self.final).any() or normalises:
             return NAN, NAN
         low, high = statistics.stratified_bootstrap([self.stratum], lambda scores: scores.mean(-1))
         return float(low), float(high)
@@ -285,8 +291,7 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
 
 
 def _reference(result: Result) -> Anchor:
-    source = f"{result.place.label}, no delay"
-    return Anchor(result.curves.final, result.smoothed[:, -1], source, result.condition.steps)
+    return Anchor(result.curves.final, result.smoothed[:, -1], result.as_reference, result.condition.steps)
 
 
 def _fewest_overrides(result: Result) -> tuple[Any, ...]:

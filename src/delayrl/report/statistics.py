@@ -62,10 +62,10 @@ def smoothed(returns: ArrayLike) -> Floats:
 def area(steps: ArrayLike, returns: ArrayLike) -> Floats:
     """Return the area under curves, [..., N], divided by the last of the steps, [N]: the mean return over training.
 
-    Each evaluation stands for the steps since the one before it.
+    Each evaluation stands for the steps since the one before it. NaN if there was none after step 0.
     """
     lengths = np.diff(np.asarray(steps, float), prepend=0)
-    return np.asarray(returns, float) @ lengths / lengths.sum()
+    return np.asarray(returns, float) @ lengths / (lengths.sum() or NAN)
 
 
 def interquartile_mean(scores: ArrayLike) -> Floats:

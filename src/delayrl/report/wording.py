@@ -123,9 +123,10 @@ AGGREGATE_CAPTION = (
 COMPARISON_CAPTION = (
     "How probable it is that a run of the row's agent ends above a run of the column's on the same task, in the mean "
     "over the tasks that both have ended on. The 95 % interval is a bootstrap over runs within their task. A "
-    f"probability is bold where it excludes 0.5. With fewer than {FEWEST} runs of either agent on a task there is no "
-    "interval. Below stands the difference of the mean normalised returns, with the anchors' uncertainty, where all "
-    "these tasks have anchors. Of many comparisons some are bold by chance."
+    "probability is bold where it excludes 0.5. Near 0 and 1 its interval is too narrow: 1.00 to 1.00 says only that "
+    "no run of the one ended below one of the other. Below stands the difference of the mean normalised returns, with "
+    "the anchors' uncertainty, where all these tasks have anchors. With fewer than "
+    f"{FEWEST} runs of either agent on a task neither has an interval. Of many comparisons some are bold by chance."
 )
 
 
