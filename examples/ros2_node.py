@@ -41,7 +41,7 @@ def make_node(policy: ControlPolicy, **settings: Any) -> Any:
             self.output = self.create_publisher(Float64MultiArray, "commands", 1)
             # best effort, because only the newest observation matters and lost ones do no harm
             self.create_subscription(JointState, "joint_states", self.observe, qos_profile_sensor_data)
-            self.create_timer(settings.get("dt") or policy.dt, self.act)
+            self.create_timer(self.controller.dt, self.act)
             self.create_timer(REPORT_EVERY, self.report)
 
         def seconds(self) -> float:

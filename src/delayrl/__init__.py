@@ -5,6 +5,7 @@ run. JAX is imported only when training or a policy is asked for: `delayrl.wrapp
 Importing delayrl registers its tasks: `gymnasium.make("delayrl/Ant-v4")`.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from delayrl.envs.registration import watch_gymnasium
@@ -58,6 +59,8 @@ _HOME = {
     "train": "training.train",
     "watch": "play.video",
 }
+_PACKAGES = ("batched", "bench", "delays", "deploy", "measure", "report", "wrappers")
+"""What pages of the documentation import from besides."""
 __all__ = sorted(_HOME)
 
 watch_gymnasium()
@@ -67,5 +70,7 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-def __getattr__(name: str) -> Any:
-    return import_later(__name__, _HOME, name)
+if not TYPE_CHECKING:  # else a checker takes every name for one of ours
+
+    def __getattr__(name: str) -> Any:
+        return import_module(f"{__name__}.{name}") if name in _PACKAGES else import_later(__name__, _HOME, name)

@@ -16,6 +16,10 @@ class StoppedError(DelayRLError):
     """A run stopped when asked to. Its newest step is stored; the same call resumes it."""
 
 
+class MissingExtraError(DelayRLError, ImportError):
+    """An optional library is not installed: which extra brings it."""
+
+
 STOPPED = 75
 """Exit status of a stopped run or an unfinished grid, which the same command resumes (EX_TEMPFAIL)."""
 
@@ -35,13 +39,13 @@ EXTRAS = {
 """Modules that each extra brings."""
 
 
-def needs_extra(error: BaseException) -> DelayRLError | None:
+def needs_extra(error: BaseException) -> MissingExtraError | None:
     """Return the error that says which extra brings a missing module; None if no module of ours is missing."""
     both = (error, error.__cause__)  # Gymnasium raises an error of its own from that of the import
     names = [one.name or "" for one in both if isinstance(one, ModuleNotFoundError)]
     module = "".join(names[:1]).partition(".")[0]
     extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
-    return DelayRLError(f"this needs {module}: pip install 'delayrl[{extra}]'") if extra else None
+    return MissingExtraError(f"this needs {module}: pip install 'delayrl[{extra}]'") if extra else None
 
 
 def import_later(package: str, homes: Mapping[str, str], name: str) -> Any:

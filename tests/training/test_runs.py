@@ -40,10 +40,18 @@ def test_a_curve_leaves_out_what_a_crash_cut(vdpo: Run, tmp_path: Path) -> None:
     assert (nothing.steps.shape, nothing.returns.shape) == ((0,), (0, 0))
 
 
+def test_a_run_outlives_a_change_of_the_directory(vdpo: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(vdpo.path.parent)
+    near = Run(vdpo.path.name)
+    monkeypatch.chdir(tmp_path)
+    assert (near, hash(near), near.rows()) == (vdpo, hash(vdpo), vdpo.rows())
+    assert str(near.path) == vdpo.path.name, "it is shown as it was given"
+
+
 def test_what_is_no_run(vdpo: Run, tmp_path: Path) -> None:
     """Folders without a configuration, the folder of several seeds, and what is no folder at all."""
     for read in (Run.rows, Run.metrics, Run.episodes, Run.curve):
-        with pytest.raises(delayrl.DelayRLError, match=r"^nowhere is not a run folder: it has no config.json$"):
+        with pytest.raises(delayrl.DelayRLError, match=r"nowhere is not a run folder: it has no config.json$"):
             read(delayrl.Run("nowhere"))
     for seed in (10, 3):
         (tmp_path / f"seed{seed}").mkdir()

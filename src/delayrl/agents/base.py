@@ -64,7 +64,7 @@ class Agent(Protocol):
     def privileged(self) -> bool:
         """Whether the behaviour policy reads the true current state in training."""
 
-    def ahead(self, spec: Spec) -> int:
+    def ahead(self, spec: Spec, /) -> int:
         """Return how many steps after t the windows reach."""
 
     def phases(self) -> tuple[Phase, ...]:
@@ -74,13 +74,13 @@ class Agent(Protocol):
     # `reference_policy(state)`, the delay-free agent that this one learns too, and its state, or None, and `every_age`,
     # whether it learns all ages up to the longest, and not only those that the delay shows.
 
-    def init(self, spec: Spec, key: Key) -> State:
+    def init(self, spec: Spec, key: Key, /) -> State:
         """Return a fresh state. Raises DelayRLError if the agent does not support the task."""
 
-    def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
+    def act(self, state: State, seen: Seen, key: Key, /, *, explore: bool) -> Action:
         """Return an action in [-1, 1]: with `explore` for training, else for evaluation, where `seen.truth` is None."""
 
-    def deterministic(self, state: State) -> Deterministic:
+    def deterministic(self, state: State, /) -> Deterministic:
         """Return the deterministic policy as networks. Raises DelayRLError if there is none."""
 
 

@@ -4,6 +4,7 @@ The numbers of a law are arrays, so they may change between two calls of a compi
 environment may have its own. As in `delayrl.delays`, a law's state is one integer, 0 at the start of an episode.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -78,7 +79,7 @@ def batched_law(law: delays.DelayLaw) -> Law:
     raise DelayRLError(f"the law {law} runs in Python, not in a compiled simulator: {hint}")
 
 
-def _chain(steps: tuple[int, ...], rows: list[tuple[float, ...]]) -> Chain:
+def _chain(steps: Sequence[int], rows: Sequence[Sequence[float]]) -> Chain:
     cumulative = np.cumsum(rows, axis=1)
     cumulative[:, -1] = 1.0
     return Chain(jnp.array(steps, jnp.int32), jnp.array(cumulative, jnp.float32))

@@ -4,7 +4,7 @@ import hashlib
 import re
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from delayrl.delays import laws
 from delayrl.delays.episodes import OURS, PerEpisode, Sum, later
@@ -35,6 +35,10 @@ class Channel:
 
     law: DelayLaw = NO_DELAY
     rule: Rule = "newest"
+
+    if TYPE_CHECKING:
+
+        def __init__(self, law: DelayLaw | int = ..., rule: Rule = ...) -> None: ...
 
     def __post_init__(self) -> None:
         if isinstance(self.law, str):
@@ -94,6 +98,11 @@ class Delay:
     observation: Channel = Channel()
     action: Channel = Channel()
     reward: Channel = Channel()
+
+    if TYPE_CHECKING:
+        _Given = Channel | DelayLaw | int
+
+        def __init__(self, observation: _Given = ..., action: _Given = ..., reward: _Given = ...) -> None: ...
 
     def __post_init__(self) -> None:
         for name in CHANNELS:

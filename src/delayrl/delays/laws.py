@@ -7,6 +7,7 @@ and sets it to 0 at the start of an episode. `str` of a law is a text that `as_d
 import itertools
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -39,7 +40,7 @@ class DelayLaw(Protocol):
     def maximum(self) -> int:
         """The longest delay."""
 
-    def draw(self, state: int, random: np.random.Generator) -> tuple[int, int]:
+    def draw(self, state: int, random: np.random.Generator, /) -> tuple[int, int]:
         """Draw the travel time of the next message.
 
         Args:
@@ -82,8 +83,8 @@ class Choice:
         probabilities: the probability of each delay; they sum to 1.
     """
 
-    steps: tuple[int, ...]
-    probabilities: tuple[float, ...]
+    steps: Sequence[int]
+    probabilities: Sequence[float]
     name: str = field(default="", compare=False)  # its text, if one of the functions below made it
 
     def __post_init__(self) -> None:
@@ -119,8 +120,8 @@ class Markov:
         transitions: row i holds the probabilities of the states that follow state i.
     """
 
-    steps: tuple[int, ...]
-    transitions: tuple[tuple[float, ...], ...]
+    steps: Sequence[int]
+    transitions: Sequence[Sequence[float]]
     name: str = field(default="", compare=False)  # its text, if one of the functions below made it
 
     def __post_init__(self) -> None:
@@ -169,7 +170,7 @@ class Markov:
 class Recorded:
     """Replay measured delays in order. Each episode starts at a random one; after the last comes the first."""
 
-    steps: tuple[int, ...]
+    steps: Sequence[int]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "steps", _delays(self.steps))
@@ -245,7 +246,7 @@ def _check_states(count: int) -> None:
         raise DelayRLError(f"a Markov chain of delays has 1 to {MOST_STATES} states; got {count}")
 
 
-def _delays(steps: tuple[int, ...]) -> tuple[int, ...]:
+def _delays(steps: Sequence[int]) -> tuple[int, ...]:
     delays = tuple(whole_steps(delay) for delay in steps)
     if not delays:
         raise DelayRLError("a law of delays needs at least one delay; it has none")
@@ -271,7 +272,7 @@ def _scaled(weights: Any) -> tuple[float, ...]:
     return tuple((np.asarray(weights) / np.sum(weights)).tolist())
 
 
-def _cumulated(probabilities: tuple[float, ...]) -> list[float]:
+def _cumulated(probabilities: Sequence[float]) -> list[float]:
     """Sum up probabilities for `bisect_right`. The last entry is exactly 1, above every random number."""
     return [*list(itertools.accumulate(probabilities))[:-1], 1.0]
 

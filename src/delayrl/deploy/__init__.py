@@ -26,7 +26,14 @@ LATER = {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"} | 
     ("AdaptedPolicy", "adapt", "export_layers", "stable_baselines_layers"), "adapter"
 )
 """Names that are imported when they are asked for, and their modules."""
+__all__ = sorted([*LATER, "ClockError", "ControlPolicy", "Controller", "OverrunError", "Statistics"])
 
 
-def __getattr__(name: str) -> Any:
-    return import_later(__name__, LATER, name)
+def __dir__() -> list[str]:
+    return __all__
+
+
+if not TYPE_CHECKING:  # else a checker takes every name for one of ours
+
+    def __getattr__(name: str) -> Any:
+        return import_later(__name__, LATER, name)

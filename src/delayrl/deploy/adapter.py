@@ -54,7 +54,7 @@ MONITOR = "stable_baselines3.common.monitor.Monitor"
 """One more of them, by its name."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AdaptedPolicy:
     """A function as a `ControlPolicy`, with the sizes of the environment that it was made for."""
 
@@ -97,10 +97,10 @@ def adapt(function: Callable[..., ArrayLike], env: gym.Env[Any, Any]) -> Adapted
         vector = augmented.augment(obs, {"actions": actions, "age": age})
         return function(np.asarray(vector, augmented.observation_space.dtype))
 
-    actions: Any = delayed.action_space
+    actions = delayed.action_space
     return AdaptedPolicy(
         function if augmented is None else of_vector,
-        delayed.observation_space.shape[0],  # type: ignore[index]  # Delayed has checked that it is flat
+        delayed.observation_space.shape[0],
         actions.shape[0],
         *inner_range(actions.low, actions.high),
         history,

@@ -36,6 +36,8 @@ class Bundle:
         self.network, self.metadata, self.backend, self._act = network, metadata, backend, act
         self.obs_size, self.action_size = network.obs_size, network.action_size
         self.low, self.high = np.asarray(network.low, np.float32), np.asarray(network.high, np.float32)
+        for bound in (self.low, self.high):  # they clip every action
+            bound.setflags(write=False)
         self.max_age = network.max_age
         dt: Any = metadata.get("dt")
         self.dt = float(dt) if type(dt) in (int, float) and SHORTEST_STEP <= dt <= LONGEST_STEP else None
@@ -43,6 +45,10 @@ class Bundle:
         self.min_age = self._steps(ages[0] if isinstance(ages, list) and ages else 0)
         self.action_delay = self._steps(metadata.get("action_delay"))
         self.idle = _idle(metadata.get("idle"), network.action_size)
+
+    def __repr__(self) -> str:
+        made = f"{self.metadata.get('agent')} on {self.metadata.get('env')}"
+        return f"Bundle({made}, ages {self.min_age}..{self.max_age}, backend {self.backend})"
 
     def _steps(self, given: Any) -> int:
         """Return a number of steps in a bundle.json; 0 if it has none, or something else."""

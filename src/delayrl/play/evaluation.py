@@ -238,8 +238,12 @@ def sweep(
         DelayRLError: as `evaluate`.
     """
     policy, task = _loaded(run, env, env_kwargs, agent)
-    for delay in range(policy.spec.delay + 1):
-        yield {**_play(policy, task, delay, episodes, seed), "learned": delay >= policy.min_age}
+    _check_number(episodes)
+    check_seed(seed)
+    return (
+        {**_play(policy, task, delay, episodes, seed), "learned": delay >= policy.min_age}
+        for delay in range(policy.spec.delay + 1)
+    )
 
 
 def _loaded(
@@ -256,9 +260,14 @@ def _loaded(
     return run, as_task(task, env_kwargs)
 
 
-def _play(policy: Policy, task: Task, delay: DelayLike, episodes: int, seed: int) -> Evaluation:
+def _check_number(episodes: int) -> None:
+    """Raise DelayRLError unless a number of episodes is a whole number from 1 on."""
     if not isinstance(episodes, int | np.integer) or episodes < 1:
         raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
+
+
+def _play(policy: Policy, task: Task, delay: DelayLike, episodes: int, seed: int) -> Evaluation:
+    _check_number(episodes)
     check_seed(seed)
     parsed = delay_of(task, delay)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)

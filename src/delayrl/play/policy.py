@@ -60,6 +60,9 @@ class Policy:
 
         self._act = jax.jit(decide)
 
+    def __repr__(self) -> str:
+        return f"Policy({self.name} on {self.task}, ages {self.min_age}..{self.spec.delay}, step {self.step})"
+
     @property
     def delay(self) -> Delay | int:
         """The delay that it was trained under; if unknown, the longest age that it takes."""

@@ -31,24 +31,24 @@ class Run:
     """A run, finished or not. It is a path too, and stands wherever a run folder does.
 
     Attributes:
-        path: its folder.
+        path: its folder, as it was given.
     """
 
     def __init__(self, path: RunLike) -> None:
         self.path = path_of(path)
-        self._folder = RunFolder(self.path)
+        self._folder = RunFolder(self.path.absolute())  # the process may change its directory
 
     def __fspath__(self) -> str:
-        return str(self.path)
+        return str(self._folder.path)
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Run) and self.path == other.path
+        return isinstance(other, Run) and self._folder.path == other._folder.path
 
     def __hash__(self) -> int:
-        return hash(self.path)
+        return hash(self._folder.path)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -22,17 +22,12 @@ from delayrl.agents.registry import AGENTS, Registration, registered
 from delayrl.envs.lookup import file_of, is_users
 from delayrl.errors import DelayRLError, DelayWarning, did_you_mean, one_line
 from delayrl.lookup import entry_points, find_object, is_unsafe, name_of_object, public_name
-from delayrl.run.configuration import OLDER, check_names, options, override, values_of
+from delayrl.run.configuration import OLDER, TAKEN, check_names, options, override, values_of
 from delayrl.run.folder import versions_in
 
 GROUP = "delayrl.agents"
 AgentLike = str | Agent | type[Agent]
 """How users give an agent: its name, its class, or an instance with hyperparameters of its own."""
-TAKEN = {
-    *("agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device"),
-    *("overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress"),
-}
-"""The parameters of `delayrl.train`, which takes options by their names too."""
 PARTS = ("privileged", "ahead", "phases", "init", "act", "deterministic")
 """What the protocol `Agent` asks for."""
 

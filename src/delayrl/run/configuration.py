@@ -27,6 +27,12 @@ OLDER: Mapping[str, Any] = {
 }
 """Options that were added later, with what an older configuration means that does not mention them."""
 
+TAKEN = {
+    *("agent", "env", "delay", "env_kwargs", "wrappers", "flatten", "preset", "seed", "seeds", "out", "device"),
+    *("overwrite", "protocol", "track", "threads", "slim", "start_from", "callback", "progress"),
+}
+"""The parameters of `delayrl.train`, which takes options by their names too."""
+
 
 @dataclass(frozen=True)
 class Option:
@@ -102,7 +108,7 @@ def check_names(values: Iterable[str], *configs: Any) -> None:
     known = [option.name for config in configs for option in options(config)]
     for name in values:
         if name not in known:
-            near = near_names(name, [*known, "start_from", "progress"])  # options of `train` alone
+            near = near_names(name, [*known, *sorted(TAKEN)])
             hint = did_you_mean(near, "`delayrl train AGENT --help` lists them")
             raise DelayRLError(f"unknown hyperparameter {name!r}{hint}")
 

@@ -8,7 +8,7 @@ as it is.
 
 from functools import partial
 from itertools import takewhile
-from typing import Any, SupportsFloat
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -74,6 +74,10 @@ class AugmentedObservation(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any],
         DelayRLError: no `Delayed` in it, another `AugmentedObservation`, observations that are not flat, or a
             `TimeLimit` around delayed rewards, which it would lose.
     """
+
+    if TYPE_CHECKING:  # as checked below
+        observation_space: Box  # type: ignore[override]
+        action_space: Box  # type: ignore[override]
 
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]]) -> None:
         delayed = find_delayed(env)

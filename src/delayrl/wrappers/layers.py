@@ -1,7 +1,9 @@
 """Questions to an environment and to what it wraps: names, spaces, the length of a step and of an episode."""
 
+import sys
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, DelayWarning
 
+PACKAGE = str(Path(__file__).parents[1])
 _warned: set[str] = set()
 REPEATS = {"RepeatAction": "num_repeats", "MaxAndSkipObservation": "_skip"}
 """Gymnasium's wrappers of which a step is several steps of what they wrap, and where they keep how many."""
@@ -97,4 +100,7 @@ def warn_once(line: str) -> None:
     """Warn of the task that a user makes. Training makes the same task many times."""
     if line not in _warned:
         _warned.add(line)
-        warnings.warn(line, DelayWarning, stacklevel=4)
+        if sys.version_info >= (3, 12):
+            warnings.warn(line, DelayWarning, skip_file_prefixes=(PACKAGE,))
+        else:
+            warnings.warn(line, DelayWarning, stacklevel=4)

@@ -1,16 +1,15 @@
 """The wrapper that delays one environment."""
 
-from typing import Any, SupportsFloat, get_args
+from typing import TYPE_CHECKING, Any, SupportsFloat, get_args
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import Autoreset, DelayObservation
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from delayrl.delays import Delay, DelayLike, as_delay
-from delayrl.delays.laws import whole_steps
 from delayrl.errors import DelayRLError
 from delayrl.wrappers.layers import check_length, check_spaces, layers_of, limit_of, name_of, seconds_of, warn_once
 from delayrl.wrappers.transit import Fill, Transit
@@ -47,9 +46,11 @@ def history_rows(env: Any, delay: Delay, history: int | None) -> int:
         warn_once(line)
     if history is None:
         return delay.maximum
-    if whole_steps(history) < delay.maximum:
+    if isinstance(history, bool) or not isinstance(history, int | np.integer):
+        raise DelayRLError(f"history is a whole number of actions; got {history!r}")
+    if history < delay.maximum:
         raise DelayRLError(f"a history of {history} actions is too short for ages up to {delay.maximum}")
-    return history
+    return int(history)
 
 
 def make_transit(delay: Delay, history: int, fill: Fill, actions: Box, idle: Any = None) -> Transit:
@@ -104,13 +105,17 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
         DelayRLError: a bad delay, an environment whose spaces are not flat boxes, or one that resets itself.
     """
 
+    if TYPE_CHECKING:  # as checked below
+        observation_space: Box  # type: ignore[override]
+        action_space: Box  # type: ignore[override]
+
     def __init__(
         self,
         env: gym.Env[NDArray[Any], NDArray[Any]],
         delay: DelayLike,
         history: int | None = None,
         fill: Fill = "first",
-        idle: NDArray[Any] | None = None,
+        idle: ArrayLike | None = None,
         step_seconds: float | None = None,
     ) -> None:
         if not isinstance(env, gym.Env):

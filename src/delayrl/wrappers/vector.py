@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from delayrl.delays import DelayLike, as_delay
 from delayrl.errors import DelayRLError
@@ -48,7 +48,7 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         delay: DelayLike,
         history: int | None = None,
         fill: Fill = "first",
-        idle: NDArray[Any] | None = None,
+        idle: ArrayLike | None = None,
         step_seconds: float | None = None,
     ) -> None:
         if not isinstance(env, VectorEnv):

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delayrl.deploy.runtime.episode import Action, Arrival, Clock, Episode, History, Stamps
+from delayrl.deploy.runtime.episode import Action, Arrival, Clock, Episode, History, Stamps, numbers
 from delayrl.deploy.runtime.telemetry import Statistics, Telemetry, served
 from delayrl.errors import DelayRLError, DelayWarning
 
@@ -56,14 +56,14 @@ class OverrunError(DelayRLError):
     """The newest observation is older than any that the policy was trained for (`on_overrun="raise"`)."""
 
 
-NEEDED = ("obs_size", "action_size", "low", "high", "max_age")
-"""What a policy must say of itself. Without `dt` its steps are of unknown length."""
+NEEDED = ("obs_size", "action_size", "low", "high", "max_age")  # what a policy must say of itself
 
 
 class ControlPolicy(Protocol):
     """A policy that a controller can run: a function with its sizes and ranges, as attributes or properties.
 
-    It may have `action_delay` and `min_age` besides, in steps: the defaults of the Controller's arguments.
+    It may have `dt`, the seconds of a step, and `action_delay` and `min_age`, in steps, besides: the defaults of the
+    Controller's arguments.
     """
 
     if TYPE_CHECKING:  # attributes, fields of a frozen dataclass and properties will all do
@@ -77,22 +77,18 @@ class ControlPolicy(Protocol):
             """Return A."""
 
         @property
-        def low(self) -> NDArray[Any]:
+        def low(self) -> ArrayLike:
             """Return the least action in range, [A]."""
 
         @property
-        def high(self) -> NDArray[Any]:
+        def high(self) -> ArrayLike:
             """Return the largest action in range, [A]."""
 
         @property
         def max_age(self) -> int:
             """Return Δ, the longest age that it accepts, in steps."""
 
-        @property
-        def dt(self) -> float | None:
-            """Return the seconds of a step; None if unknown."""
-
-    def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int) -> NDArray[np.float32]:
+    def __call__(self, obs: NDArray[Any], actions: NDArray[np.float32], age: int, /) -> ArrayLike:
         """Return the action [A] for an observation [S] of this age and the actions [Δ, A] since.
 
         The actions are in order, oldest first; zeros follow the first `age` of them.
@@ -141,12 +137,11 @@ class Controller:
         self.min_age = _steps(policy, "min_age", min_age)
         self._clock = Clock(stamps, getattr(policy, "dt", None) if stamps == "seconds" and dt is None else dt, clock)
         _warn_of_period(policy, self._clock)
-        steady = None if idle is None else _action(policy, idle, "idle")
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
-        first = _first_action(policy)
-        capacity, counts = policy.max_age + self.action_delay + EXTRA_STEPS, self._telemetry.counts
-        self._history = partial(History, self._clock.period, self.action_delay, capacity, steady, first, counts)
+        actions = None if idle is None else _action(policy, idle, "idle"), _first_action(policy)
+        sizes = self._clock.period, self.action_delay, policy.max_age + self.action_delay + EXTRA_STEPS
+        self._history = partial(History, *sizes, *actions, self._telemetry.counts)
         self._episode = self._new_episode(0, 0.0 if stamps == "steps" else -np.inf)
         _try(policy)
 
@@ -154,10 +149,14 @@ class Controller:
         return Episode(number, start, self._clock, self._history(), self.min_age, self.policy.max_age)
 
     @property
+    def dt(self) -> float:
+        """The seconds of a step. Raises DelayRLError if stamps are in steps."""
+        return self._clock.seconds
+
+    @property
     def serves(self) -> str:
         """The delays of observations that the policy serves at this action delay, in words."""
-        dt = self._clock.period if self.stamps == "seconds" else None
-        return served(self.min_age, self.policy.max_age, self.action_delay, dt)
+        return served(self.min_age, self.policy.max_age, self.action_delay, None if self.stamps == "steps" else self.dt)
 
     @property
     def ready(self) -> bool:
@@ -186,8 +185,7 @@ class Controller:
         Raises ClockError if `now` is not finite, or beyond ±1e15.
         """
         with self._act_lock, self._state_lock:
-            start = 0.0 if self.stamps == "steps" else self._clock.now(now, 0)
-            self._episode = self._new_episode(self.episode + 1, start)
+            self._episode = self._new_episode(self.episode + 1, self._clock.start(now))
 
     def observe(self, obs: ArrayLike, stamp: float, now: float | None = None, *, episode: int | None = None) -> Arrival:
         """Take in an observation. Call it for every one that arrives, in any order and as often as it arrives.
@@ -232,8 +230,7 @@ class Controller:
             with self._state_lock:
                 now = self._episode.command_time(now)
                 shown = self._episode.shown(now)
-                age = shown.age
-                if age > limit:
+                if (age := shown.age) > limit:
                     self._telemetry.counts["overruns"] += 1
                     if self.on_overrun == "raise":
                         self._telemetry.asked(shown)
@@ -310,7 +307,7 @@ def _check(policy: ControlPolicy) -> None:
         raise DelayRLError(f"a policy also says its {', '.join(missing)} (see ControlPolicy); got {policy!r:.80}{hint}")
     if not isinstance(policy.max_age, int | np.integer) or policy.max_age < 0:
         raise DelayRLError(f"the policy's max_age is a whole number of steps, 0 or more; got {policy.max_age!r:.80}")
-    low, high = _numbers(policy.low, np.float64), _numbers(policy.high, np.float64)
+    low, high = numbers(policy.low, np.float64), numbers(policy.high, np.float64)
     if not low.shape == high.shape == (policy.action_size,) or not (low <= high).all():
         line = f"the policy's low and high are {policy.action_size} numbers each, none of low above that of high"
         raise DelayRLError(f"{line}; got {low.tolist()} and {high.tolist()}")
@@ -329,22 +326,14 @@ def _in_range(policy: ControlPolicy, action: Action) -> Action:
 
 
 def _observation(policy: ControlPolicy, obs: ArrayLike) -> NDArray[np.float64]:
-    values = _numbers(obs, np.float64)
+    values = numbers(obs, np.float64)
     if values.shape != (policy.obs_size,):
         raise DelayRLError(f"the policy takes observations of size {policy.obs_size}; got shape {values.shape}")
     return values
 
 
 def _action(policy: ControlPolicy, action: ArrayLike, name: str) -> Action:
-    values = _numbers(action, np.float32)
+    values = numbers(action, np.float32)
     if values.shape != (policy.action_size,) or not np.isfinite(values).all():
         raise DelayRLError(f"{name} must be {policy.action_size} finite numbers; got {values.tolist()}")
     return values
-
-
-def _numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
-    try:
-        with np.errstate(over="ignore"):  # overflow gives infinity, which is refused where it matters
-            return np.array(values, dtype)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DelayRLError(f"a flat array of numbers is needed; got {' '.join(repr(values).split())[:80]}") from error

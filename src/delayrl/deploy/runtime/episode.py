@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from delayrl.errors import DelayRLError
 
@@ -45,6 +45,17 @@ class Clock:
             raise DelayRLError(f"stamps in seconds need the seconds of a step, {allowed}: give dt=…; got {dt!r}")
         self.stamps, self._read = stamps, read
         self.period = 1.0 if dt is None else float(dt)
+
+    @property
+    def seconds(self) -> float:
+        """The seconds of a step. Raises DelayRLError if stamps are in steps."""
+        if self.stamps == "steps":
+            raise DelayRLError("steps have no length in seconds; stamps='seconds' have")
+        return self.period
+
+    def start(self, now: float | None) -> float:
+        """Return when an episode starts that is reset at `now`; None reads the clock. Steps start at 0."""
+        return 0.0 if self.stamps == "steps" else self.now(now, 0)
 
     def number(self, time: float) -> float:
         """Return a time as a float. Raises DelayRLError if it is not a number, or a fraction of a step."""
@@ -293,3 +304,12 @@ class Episode:
 
 def _stamp(kept: tuple[float, NDArray[np.float64]]) -> float:
     return kept[0]
+
+
+def numbers(values: ArrayLike, dtype: Any) -> NDArray[Any]:
+    """Return an array of numbers of this type. Raises DelayRLError for anything else."""
+    try:
+        with np.errstate(over="ignore"):  # overflow gives infinity, which is refused where it matters
+            return np.array(values, dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DelayRLError(f"a flat array of numbers is needed; got {' '.join(repr(values).split())[:80]}") from error
