@@ -10,8 +10,7 @@ from pathlib import Path
 
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.play.run import Run
-
-KEPT = ("step", "policy", "episode", "reset_seed", "return", "length")
+from delayrl.run.rows import EPISODE
 
 
 def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = False) -> None:
@@ -22,7 +21,7 @@ def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = 
         metrics = run.metrics()
         speed = metrics[-1]["steps_per_second"] if metrics else None
         lines.append({"run": number, "config": run.config, "steps_per_second": speed})
-        lines += [{"run": number} | {name: row[name] for name in KEPT} for row in run.rows()]
+        lines += [{"run": number} | {name: row[name] for name in EPISODE} for row in run.rows()]
         if episodes:
             lines.append({"run": number, "evaluation": evaluate(path, episodes, seed=run.config["seed"])})
         if episodes and every_delay:

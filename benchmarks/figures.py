@@ -280,23 +280,13 @@ def main() -> None:
     images = root / "docs" / "img"
     last_frame(images / "episodes.gif")
     measured(images / "measure.png")
-    if (HERE / "results" / "pusher-random.jsonl").exists():
-        title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
-        shown = {agent: COLOURS[agent] for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
-        sweeps.draw(sweeps.read(HERE / "results" / "pusher-random.jsonl"), title, images / "pusher-delays.png", shown)
-    for name, pages in {
-        "pendulum": ["docs/benchmarks.md"],
-        "reacher": ["docs/benchmarks.md"],
-        "walk": ["docs/benchmarks.md"],
-        "walk-random": ["docs/benchmarks.md"],
-        "pusher-random": ["docs/benchmarks.md"],
-    }.items():
-        if (HERE / "results" / f"{name}.jsonl").exists():
-            for page in pages:
-                insert(root / page, name, table(name) + "\n\n" + provenance(name))
+    title = "delayrl/Pusher-v4, trained under paper-stochastic-5, three seeds"
+    shown = {agent: COLOURS[agent] for agent in ("vdpo", "bpql", "a-sac", "sac-memoryless")}
+    sweeps.draw(sweeps.read(HERE / "results" / "pusher-random.jsonl"), title, images / "pusher-delays.png", shown)
+    for name in ("pendulum", "reacher", "walk", "walk-random", "pusher-random"):
+        insert(root / "docs" / "benchmarks.md", name, table(name) + "\n\n" + provenance(name))
     insert(root / "docs" / "protocols.md", "entropies", entropies("pusher-entropy"))
-    if (HERE / "results" / "overhead.jsonl").exists():
-        insert(root / "docs" / "delays.md", "overhead", overhead())
+    insert(root / "docs" / "delays.md", "overhead", overhead())
     udp, overruns, younger = (
         [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
         for name in ("udp", "overruns", "younger")
@@ -307,16 +297,14 @@ def main() -> None:
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
     for name, folder in {"first": "", "evidence-1": "evidence-1", "evidence-2": "evidence-2"}.items():
-        if (rows := HERE / "results" / f"{name}.sqlite").exists():
-            delayrl(["bench", "report", str(rows), "--out", str(root / "docs" / "results" / folder)])
-    if list((HERE / "results" / "learning").glob("*.jsonl")):
-        text = learning.section(HERE / "results" / "learning", images / "learning.png")
-        insert(root / "docs" / "benchmarks.md", "learning", text)
+        rows = HERE / "results" / f"{name}.sqlite"
+        delayrl(["bench", "report", str(rows), "--out", str(root / "docs" / "results" / folder)])
+    text = learning.section(HERE / "results" / "learning", images / "learning.png")
+    insert(root / "docs" / "benchmarks.md", "learning", text)
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("any-age-ladder", "any-age-crossq")]
-    if rows := [file for file in rows if file.exists()]:
-        arms, goals = ladder.sections(rows, images / "ladder.png")
-        insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
-        insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
+    arms, goals = ladder.sections([file for file in rows if file.exists()], images / "ladder.png")
+    insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
+    insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
     usual, every = (HERE / "results" / f"halfcheetah-ages{name}.jsonl" for name in ("", "-any"))
     title, wide = "HalfCheetah-v5, trained under uniform:1:25, five seeds", "any-age second_age=any"
     played = sweeps.read(usual) | {wide: sweeps.read(every)["any-age"]}
@@ -331,15 +319,13 @@ def main() -> None:
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)
     insert(root / "docs" / "which-agent.md", "lost", lost.section(rows, images / "lost.png"))
-    if forecast.OUT.exists():
-        insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
-    if list((HERE / "results" / "times").glob("*.jsonl")):
-        text = times.section(HERE / "results" / "times", images / "times.png")
-        insert(root / "docs" / "performance.md", "times", text)
+    insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
+    text = times.section(HERE / "results" / "times", images / "times.png")
+    insert(root / "docs" / "performance.md", "times", text)
     insert(root / "docs" / "performance.md", "costs", costs("HalfCheetah-v5", (5, 25, 50)))
     insert(root / "docs" / "which-agent.md", "relative-costs", relative_costs("HalfCheetah-v5", (5, 25, 50)))
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2", "any-age-ladder")]
-    insert(root / "docs" / "which-agent.md", "which", which.section([file for file in rows if file.exists()]))
+    insert(root / "docs" / "which-agent.md", "which", which.section(rows))
     for key, text in speed.pages(root).items():
         insert(HERE / "speed" / "README.md" if key in DETAILS else root / "docs" / "performance.md", key, text)
 

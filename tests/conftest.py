@@ -8,6 +8,7 @@ import ctypes
 import gc
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -92,6 +93,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     shared = [item for item in items if item.path.name == "test_agents.py"]
     by_agent = iter(sorted(shared, key=lambda item: item.callspec.params.get("name", "") if "[" in item.name else ""))
     items[:] = [next(by_agent) if item.path.name == "test_agents.py" else item for item in items]
+
+
+@pytest.fixture(autouse=True)
+def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking for modules in the working folder changes the path for good."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
 
 
 @pytest.fixture(autouse=True)

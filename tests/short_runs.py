@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import delayrl
+from delayrl.cli.main import main
 from delayrl.play.run import Run
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder, RunLike
@@ -78,3 +79,14 @@ def declare(folder: Path, group: str, **points: str) -> None:
     (home / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {group.replace('.', '_')}\nVersion: 1.0\n")
     lines = [f"{name} = {source}" for name, source in points.items()]
     (home / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines, ""]))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run `delayrl` with arguments that it must refuse in one line, and return that line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        main(list(map(str, arguments)))
+    captured = capsys.readouterr()
+    assert (end.value.code, captured.out, captured.err.count("\n")) == (2, "", 1), captured.err
+    assert captured.err.startswith("delayrl: ")
+    return captured.err

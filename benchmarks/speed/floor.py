@@ -29,6 +29,7 @@ from delayrl.play.policy import spec_of
 from delayrl.run.configuration import override
 from delayrl.training.actor import Actor
 from delayrl.training.buffers import keep_buffers
+from delayrl.training.checks import replay_bytes
 from delayrl.training.products import matmul_flops
 from delayrl.training.train import on_device
 
@@ -197,12 +198,6 @@ def update_seconds(phase: Phase, reach: tuple[int, int, int], state: Any, replay
         return jax.lax.scan(step, state, jnp.arange(count))[0]
 
     return median_seconds(partial(several, state, replay, keys)) / count
-
-
-def replay_bytes(spec: Any, capacity: int) -> int:
-    """Return the bytes of one seed's replay."""
-    shapes = jax.eval_shape(lambda: ring.init(spec, capacity))
-    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(shapes))
 
 
 def main() -> None:

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from works import SIZES, WORKS, Work
 
+from delayrl.cli.console import pair
+
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results" / "speed.jsonl"
 WAITING = {kind: ("", "passive") for kind in ("vdpo", "sb3", "cleanrl")}
@@ -290,15 +292,6 @@ def report(row: dict[str, Any]) -> str:
         words += f"ratio {ratio['median']:.2f} ({ratio['low']:.2f} to {ratio['high']:.2f})"
         words += f", of processor time {row['processor_ratio']['median']:.2f}"
     return words + f"; load {row['load']['median']:.1f}"
-
-
-def pair(text: str) -> tuple[str, Any]:
-    """Split NAME=VALUE; the value is JSON if it parses as JSON, otherwise text."""
-    name, _, value = text.partition("=")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
 
 
 def arguments() -> argparse.Namespace:

@@ -16,7 +16,7 @@ from delayrl.cli.console import Parser, pair
 from delayrl.cli.main import COMMANDS, main
 from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
-from short_runs import newest
+from short_runs import newest, refused
 
 SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
 SMALL += ["--batch-size", "8", "--hidden", "8", "8", "--replay-capacity", "250"]
@@ -28,18 +28,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cli") / "run"
     main(["train", "vdpo", "--env", "Reacher-v5", "--delay", "3", "--out", str(path), *TINY])
     return path
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main(list(arguments))
-    captured = capsys.readouterr()
-    assert end.value.code == 2
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1, captured.err
-    assert captured.err.startswith("delayrl: ")
-    return captured.err
 
 
 def test_train_ends_with_a_summary(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

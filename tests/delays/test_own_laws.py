@@ -1,6 +1,5 @@
 """A law of a user is drawn from, named, read back and refused as one of ours."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,6 @@ from own_tasks import make_arm, write_module
 from short_runs import declare
 
 BURST = "own_laws:Burst(length=2, rate=0.1, steps=3)"
-
-
-@pytest.fixture(autouse=True)
-def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looking for modules in the working folder changes the path for good."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
 
 
 def drawn(law: Any, count: int) -> list[int]:

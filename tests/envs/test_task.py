@@ -15,20 +15,13 @@ from gymnasium.wrappers import NormalizeObservation, RepeatAction, TimeLimit
 import delayrl
 import own_tasks
 from delayrl.envs.making import delay_of, make
-from delayrl.envs.task import Part, Task, as_task, closing, stored_task
+from delayrl.envs.task import Part, Task, as_task, closing_quietly, stored_task
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.run.condition import resolve
 from delayrl.wrappers import layers
 from delayrl.wrappers.layers import limit_of, seconds_of
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
-
-
-@pytest.fixture(autouse=True)
-def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looking for modules in the working folder changes the path for good."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-
 
 # ------------------------------------------------------------------------------------------------ the text
 
@@ -376,7 +369,7 @@ def test_rounding_brings_no_action_beyond_its_range() -> None:
             assert self.action_space.contains(action), action
             return super().step(action)
 
-    with closing(make(Valve, 0, wrappers=[LIMIT], rescale=True)) as env:
+    with closing_quietly(make(Valve, 0, wrappers=[LIMIT], rescale=True)) as env:
         env.reset(seed=0)
         for action in np.linspace(-1, 1, 9, dtype=np.float32):
             env.step(np.full(1, action))

@@ -26,6 +26,7 @@ from delayrl.measure import from_log, probe
 from delayrl.measure.ages import rounded_up_steps
 from delayrl.measure.reading import Table, read_signals
 from delayrl.wrappers import AugmentedObservation, Delayed
+from short_runs import refused
 
 ROOT = Path(__file__).parents[2]
 
@@ -808,16 +809,6 @@ def test_parquet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 # ---------------------------------------------------------------------------------------- command line
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as end:
-        main(["measure", *map(str, arguments)])
-    captured = capsys.readouterr()
-    assert (end.value.code, captured.out, captured.err.count("\n")) == (2, "", 1), captured.err
-    assert captured.err.startswith("delayrl: ")
-    return captured.err
-
-
 def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, saved = log(tmp_path / "log.csv", *signals("servo", 4)), tmp_path / "steps.txt"
     main(["measure", str(path), "--period", "20ms", "--plot", str(tmp_path / "a.png")])
@@ -826,7 +817,7 @@ def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     for words in ("dead time                 80 ms", *recommended):
         assert words in out
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    assert "only stamps give a delay of each step" in refused(capsys, path, "--save", saved)
+    assert "only stamps give a delay of each step" in refused(capsys, "measure", path, "--save", saved)
     assert not saved.exists()
     main(["measure", str(path), "--period", "40ms", "--json"])
     result = json.loads(capsys.readouterr().out)
@@ -843,7 +834,7 @@ def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     result = json.loads(capsys.readouterr().out)
     assert (result["train_with"], result["in_step"], result["steps"]) == ("episode:3:4", "4", {"4": 380})
     assert "replay" not in result
-    assert "No such file" in refused(capsys, path, "--save", tmp_path / "no" / "x.txt")
+    assert "No such file" in refused(capsys, "measure", path, "--save", tmp_path / "no" / "x.txt")
 
 
 def test_a_slow_camera_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -881,11 +872,11 @@ def test_command_for_environments(tmp_path: Path, monkeypatch, capsys: pytest.Ca
         ("my_broken_task:make_env", "cannot import"),
         ("Pendulm-v1", "did you mean Pendulum-v1"),
     ):
-        assert words in refused(capsys, target)
-    assert "--period is an option of a log" in refused(capsys, "Pendulum-v1", "--period", "20ms")
-    assert "--warm-up is an option of a log" in refused(capsys, "Pendulum-v1", "--warm-up", "0s")
-    assert "count from 1" in refused(capsys, "Pendulum-v1", "--episodes", "0")
-    assert "counts steps" in refused(capsys, "Pendulum-v1", "--longest", "1s")
+        assert words in refused(capsys, "measure", target)
+    assert "--period is an option of a log" in refused(capsys, "measure", "Pendulum-v1", "--period", "20ms")
+    assert "--warm-up is an option of a log" in refused(capsys, "measure", "Pendulum-v1", "--warm-up", "0s")
+    assert "count from 1" in refused(capsys, "measure", "Pendulum-v1", "--episodes", "0")
+    assert "counts steps" in refused(capsys, "measure", "Pendulum-v1", "--longest", "1s")
 
 
 TIME, COMMAND, OBS = ROW * np.arange(400), *signals("servo", 4, 400)
@@ -920,7 +911,7 @@ def replaced(values: np.ndarray, row: int, by: object) -> list:
     ],
 )
 def test_bad_logs(columns: dict, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert words in refused(capsys, write(tmp_path / "log.csv", columns))
+    assert words in refused(capsys, "measure", write(tmp_path / "log.csv", columns))
 
 
 def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -933,8 +924,8 @@ def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("twice.csv", b"time,obs,obs\n0,1,2\n", "two columns of the same name"),
     ):
         (tmp_path / name).write_bytes(content)
-        assert words in refused(capsys, tmp_path / name)
-    assert "no such file" in refused(capsys, tmp_path / "missing.csv")
+        assert words in refused(capsys, "measure", tmp_path / name)
+    assert "no such file" in refused(capsys, "measure", tmp_path / "missing.csv")
     path = log(tmp_path / "log.csv", *signals("servo", 4, 400))
     for option, words in (
         ("--period 20kg", "a time such as 20ms"),
@@ -951,7 +942,7 @@ def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("--episodes 3", "an option of an environment"),
         (f"--plot {tmp_path / 'x.tape'}", ".png"),
     ):
-        assert words in refused(capsys, path, *option.split())
+        assert words in refused(capsys, "measure", path, *option.split())
 
 
 def test_example_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -129,7 +129,7 @@ def test_true_steps_are_stored() -> None:
 @pytest.mark.parametrize("limit", ["bootstraps", "terminates"])
 def test_time_limit(limit: str) -> None:
     """It ends the episode; that no value follows, is said under the protocol alone that says so."""
-    protocol = Protocol("mine", time_limit=limit)  # type: ignore[arg-type]
+    protocol = Protocol(time_limit=limit)  # type: ignore[arg-type]
     actor = Actor(make("delayrl/Walk-v0", 2, rescale=True), 0, privileged=False, protocol=protocol)
     steps = [actor.step(np.zeros(1, np.float32)) for _ in range(50)]
     assert [bool(step.done) for step in steps] == [False] * 49 + [True]
@@ -137,7 +137,7 @@ def test_time_limit(limit: str) -> None:
 
 
 def test_one_start_state_has_many_travel_times() -> None:
-    protocol = Protocol("mine", start_states="same")
+    protocol = Protocol(start_states="same")
     actor = Actor(make("delayrl/Walk-v0", "uniform:0:3", rescale=True), 7, privileged=False, protocol=protocol)
     starts, ages = [], []
     for _ in range(3):

@@ -41,12 +41,6 @@ SHORT: dict[str, Any] = {"steps": 250, "random_steps": 100, "replay_capacity": 1
 SHORT |= {"evaluation_episodes": 2, "preset": "small", "progress": False}
 
 
-@pytest.fixture(autouse=True)
-def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looking for modules in the working folder changes the path for good."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-
-
 def train(agent: Any, out: Path, **values: Any) -> Run:
     return delayrl.train(agent, make_arm, 3, out=out, **{**SHORT, **values})
 

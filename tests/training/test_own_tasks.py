@@ -31,12 +31,6 @@ LENGTH = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", 
 LENGTH += ["--replay-capacity", "250", "--quiet"]
 
 
-@pytest.fixture(autouse=True)
-def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looking for modules in the working folder changes the path for good."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-
-
 def test_a_run_names_its_task(tmp_path: Path) -> None:
     """By one text, in its configuration, its rows and its folder; class and text are one condition."""
     values: dict[str, Any] = {"env_kwargs": {"gain": 0.5}, "wrappers": [LIMIT, Camera], "flatten": True}

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +22,6 @@ from own_laws import Burst
 from short_runs import SHRINK, arrays, killed_and_resumed, train
 
 BURST = "own_laws:Burst(length=2, rate=0.3, steps=3)"
-
-
-@pytest.fixture(autouse=True)
-def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looking for modules in the working folder changes the path for good."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
 
 
 def test_a_named_law(tmp_path: Path) -> None:

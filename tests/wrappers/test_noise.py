@@ -120,7 +120,7 @@ def test_replaying_an_episode_repeats_its_noise() -> None:
 @pytest.mark.parametrize(("start_states", "different"), [("own", 4), ("same", 1)])
 def test_each_episode_has_noise_of_its_own(start_states, different: int) -> None:
     """Even where, as in the released code, all of them start in the same state."""
-    protocol = Protocol("a test's", start_states=start_states)
+    protocol = Protocol(start_states=start_states)
     actor = Actor(delayrl.make("delayrl/NoisyWalk-v0", 1, rescale=True), 0, False, protocol)
     starts, moves = set(), set()
     for _ in range(4):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from delayrl.envs.making import make
-from delayrl.envs.task import as_task, closing
+from delayrl.envs.task import as_task, closing_quietly
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
@@ -234,9 +234,10 @@ def _seed_groups(seeds: int | list[int], lockstep: int | None) -> list[tuple[int
 def _setup(agent: str, env: str, delay: float | str, preset: str, protocol: str, overrides: str) -> tuple[Setup, int]:
     """Resolve a condition. Returns the bytes of a seed's replay too. Raises DelayRLError if it cannot be trained."""
     setup = resolve(agent, env, delay, preset, protocol, json.loads(overrides))
-    with closing(make(env, setup.delay.observed())) as task:
+    with closing_quietly(make(env, setup.delay.observed())) as task:
         check_fit(setup, task)
-        return setup, replay_bytes(setup, spec_of(task))
+        spec = spec_of(task)
+        return setup, replay_bytes(spec, setup.replay_rows(spec))
 
 
 def _check_overlap(cells: list[Planned]) -> None:

@@ -124,9 +124,9 @@ def _counts(title: str, counts: Counts | None) -> list[str]:
         ((steps, times),) = counts.items()
         return [f"{title:<18} {count(steps, 'step')}  ({times} times)"]
     total = sum(counts.values())
-    mean = sum(steps * count for steps, count in counts.items()) / total
+    mean = sum(steps * times for steps, times in counts.items()) / total
     head = f"{title:<18} {min(counts)} to {max(counts)} steps, mean {mean:.2f}, {total} times"
-    return [head] + [f"{'':<18}   {steps:>3}  {count / total:6.1%}" for steps, count in counts.items()]
+    return [head] + [f"{'':<18}   {steps:>3}  {times / total:6.1%}" for steps, times in counts.items()]
 
 
 def _show_log(e: Estimated, saved: Path | None, doubtful: bool) -> str:

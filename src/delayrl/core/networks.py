@@ -116,10 +116,10 @@ def gaussian(
     x: Float[Array, "*batch inputs"],
     log_std_range: tuple[float, float],
     bounds: LogStdBounds = "rescale",
-    network: Network | None = None,
+    network: Network = mlp,
 ) -> Gaussian:
-    """Return the Gaussian that `mlp`, or another network, outputs; a rescaled tanh or clipping bounds its log-std."""
-    mean, log_std = jnp.split((network or mlp)(params, x), 2, -1)
+    """Return the Gaussian that `network` outputs; a rescaled tanh or clipping bounds its log-std."""
+    mean, log_std = jnp.split(network(params, x), 2, -1)
     low, high = log_std_range
     if bounds == "rescale":
         return Gaussian(mean, low + 0.5 * (high - low) * (jnp.tanh(log_std) + 1))

@@ -13,7 +13,6 @@ random or zero."""
 class Protocol:
     """One way to train and evaluate. docs/protocols.md compares the two protocols, for each agent."""
 
-    name: str  # as in result rows and on the command line
     start_states: Literal["own", "same"] = "own"  # a new one per episode, or always the one that the run's seed gives
     time_limit: Literal["bootstraps", "terminates", "dropped"] = "bootstraps"  # whether targets keep the next state's
     # value where it ends an episode, or whether the step that it ends is not learned from
@@ -31,7 +30,7 @@ def opening_length(opening: Opening, delay: int) -> int:
     return {"agent": 0, "one-random": min(delay, 1)}.get(opening, delay)
 
 
-CORRECTED = Protocol("corrected")
+CORRECTED = Protocol()
 """The default."""
-OFFICIAL = Protocol("official", overrides={"entropy_unit": "task"})
+OFFICIAL = Protocol(overrides={"entropy_unit": "task"})
 """What all released code of this family shares; the registry adds each agent's own habits."""

@@ -10,7 +10,7 @@ from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import check_same, pack, space_json
 from delayrl.envs.making import make, seconds_of
-from delayrl.envs.task import Task, TaskLike, closing, stored_task
+from delayrl.envs.task import Task, TaskLike, closing_quietly, stored_task
 from delayrl.play.policy import Policy, restored
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
@@ -94,7 +94,7 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
 
 def describe(run: RunFolder, config: dict[str, Any], step: int, policy: Policy, task: Task) -> dict[str, Any]:
     """Return what a bundle says about its run: task, spaces, seconds a step, delay, training, last evaluation."""
-    with closing(make(task, policy.delay)) as env:
+    with closing_quietly(make(task, policy.delay)) as env:
         seconds = seconds_of(env)
     copied = ("agent", "preset", "env", "delay", "protocol", "privileged", "seed", "hyperparameters")
     return {

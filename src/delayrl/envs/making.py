@@ -11,7 +11,7 @@ from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 from delayrl.delays import Delay, DelayLike, as_delay
 from delayrl.envs import paper
-from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task, closing
+from delayrl.envs.task import Task, TaskLike, WrapperLike, as_task, closing_quietly
 from delayrl.errors import DelayRLError, did_you_mean, near_names
 from delayrl.wrappers import Delayed, check_spaces
 from delayrl.wrappers.layers import check_length
@@ -88,7 +88,7 @@ def delay_of(env: TaskLike, delay: DelayLike) -> Delay:
     """Convert a delay to steps of a task, which is made only if its step length is needed. Raises DelayRLError."""
 
     def step_seconds() -> float | None:
-        with closing(task.make()) as made:
+        with closing_quietly(task.make()) as made:
             return seconds_of(made)
 
     task = as_task(env)
@@ -113,5 +113,5 @@ def tasks() -> Iterator[tuple[str, Any, float | None]]:
     small = ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Pendulum-v1"]
     ours = sorted(name for name in gym.registry if name.startswith("delayrl/"))
     for name in [f"{task}-v5" for task in paper.TASKS] + small + ours:
-        with closing(make(name)) as env:
+        with closing_quietly(make(name)) as env:
             yield name, env, seconds_of(env)

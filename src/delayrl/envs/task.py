@@ -230,7 +230,7 @@ def quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def closing(env: Any) -> Iterator[Any]:
+def closing_quietly(env: Any) -> Iterator[Any]:
     """Yield an environment, and close it at the end. What its `close` raises changes no result, and is left aside."""
     try:
         yield env

@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from delayrl.envs.making import name_of
-from delayrl.envs.task import TaskLike, as_task, closing
+from delayrl.envs.task import TaskLike, as_task, closing_quietly
 from delayrl.errors import DelayRLError, one_line
 from delayrl.measure.pushes import Array, Env, Pushes, Rollout, actions, differs, play, push, repeating
 
@@ -85,7 +85,7 @@ def probe(
     """
     if episodes < 1 or longest < 1:
         raise DelayRLError(f"episodes and longest count from 1; got {episodes} and {longest}")
-    made = nullcontext(env) if isinstance(env, gym.Env) else closing(as_task(env).make())
+    made = nullcontext(env) if isinstance(env, gym.Env) else closing_quietly(as_task(env).make())
     with made as task, one_line(f"{name_of(task)} failed while it was played"):
         return _probe(task, episodes, seed, longest, wrap)
 

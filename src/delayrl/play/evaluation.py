@@ -17,7 +17,7 @@ from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, DelayLike
 from delayrl.envs.making import check_limit, delay_of, make, name_of
-from delayrl.envs.task import Task, TaskLike, as_task, closing
+from delayrl.envs.task import Task, TaskLike, as_task, closing_quietly
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.play.policy import Policy, load, spec_of
@@ -82,7 +82,8 @@ class Evaluator:
         self._delay, self._apply, self._shape = spec.delay, apply, (seeds, episodes)
         self._act = _compiled_act(agent)
         with contextlib.ExitStack() as held:
-            self._envs = [held.enter_context(closing(make(env, served, rescale=True))) for _ in range(seeds * episodes)]
+            made = (make(env, served, rescale=True) for _ in range(seeds * episodes))
+            self._envs = [held.enter_context(closing_quietly(one)) for one in made]
             check_fits(self._envs[0], spec)
             check_limit(self._envs[0], str(as_task(env)))
             self._held = held.pop_all()  # now that nothing is refused any more

@@ -14,7 +14,7 @@ from delayrl.core.types import Action, Key, Seen, Spec
 from delayrl.core.views import seen_now
 from delayrl.delays import Delay, stored_delay
 from delayrl.envs.making import make
-from delayrl.envs.task import Task, TaskLike, closing, stored_task
+from delayrl.envs.task import Task, TaskLike, closing_quietly, stored_task
 from delayrl.errors import DelayRLError
 from delayrl.run.agents import AgentLike, agent_of, warn_of_other_code
 from delayrl.run.arrays import age_of, inner_range, restore_tree
@@ -145,7 +145,7 @@ def restored(
     if given is None:
         warn_of_other_code(config, run.path, agent)
     trained = stored_delay(config["delay"], run.path)
-    with closing(make(task, trained)) as env:
+    with closing_quietly(make(task, trained)) as env:
         spec, actions = spec_of(env), env.action_space
     try:
         state = restore_tree(template(agent, spec), checkpoint.arrays("agent"), checkpoint.path)

@@ -134,7 +134,7 @@ def _episode(env: Any, policy: Policy, seed: int, camera: str | None, stride: in
     yield Moment(_picture(env), number, step, info["age"], total, over)
     while not over:
         obs, reward, terminated, truncated, info = stepping.step(env, policy.act(obs, info))
-        step, total, over = step + 1, total + float(reward), terminated or truncated
+        step, total, over = step + 1, total + reward, terminated or truncated
         if over or step % stride == 0:
             yield Moment(_picture(env), number, step, info["age"], total, over)
 

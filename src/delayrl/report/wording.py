@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from delayrl.errors import count
@@ -28,19 +29,20 @@ def number(value: float, like: float | None = None) -> str:
     return f"{value:,.0f}" if size >= 1000 else f"{value:,.1f}" if size >= 10 else f"{value:,.2f}"
 
 
-def normalised(value: float, like: float = 0) -> str:
+def normalised(value: float) -> str:
     """Write a normalised return."""
     return f"{value:.2f}"
 
 
-def steps(value: float, like: float = 0) -> str:
+def steps(value: float) -> str:
     """Write environment steps, large numbers in millions as the paper does."""
     return "" if math.isnan(value) else f"{value / 1e6:.2f}M" if value >= 1e5 else f"{value:,.0f}"
 
 
-def spread(value: float, std: float, write: Callable[[float, float], str] = number) -> str:
-    """Write mean ± standard deviation; a deviation of NaN is left out."""
-    return "" if math.isnan(value) else write(value, value) + ("" if math.isnan(std) else f" ± {write(std, value)}")
+def spread(value: float, std: float, write: Callable[[float], str] | None = None) -> str:
+    """Write mean ± standard deviation, by default with equally many decimals; a deviation of NaN is left out."""
+    write = write or partial(number, like=value)
+    return "" if math.isnan(value) else write(value) + ("" if math.isnan(std) else f" ± {write(std)}")
 
 
 def anchor(anchor: Anchor) -> str:

@@ -77,7 +77,7 @@ class Setup:
         names = {name: getattr(self.condition, name) for name in ("agent", "preset", "env", "delay", "protocol")}
         options = {"hyperparameters": values_of(self.agent), "schedule": values_of(self.schedule)}
         rules = {f.name: value for f in fields(Protocol) if (value := getattr(self.protocol, f.name)) != f.default}
-        habits = {name: value for name, value in rules.items() if name not in ("name", "overrides")}
+        habits = {name: value for name, value in rules.items() if name != "overrides"}
         more = {"habits": habits, "unnamed": dict(self.unnamed), "origin": dict(self.origin)}
         return names | {"privileged": self.agent.privileged} | options | {k: v for k, v in more.items() if v}
 

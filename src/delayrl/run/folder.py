@@ -17,7 +17,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -99,7 +99,7 @@ class RunFolder:
     def append(self, name: str, rows: list[dict[str, Any]]) -> None:
         """Add lines to one of the files LINES."""
         with disk_errors(self.path), open(self.path / f"{name}.jsonl", "a") as file:
-            file.write("".join(json.dumps(row) + "\n" for row in rows))
+            file.write(_lines(rows))
             file.flush()
             os.fsync(file.fileno())
 
@@ -121,7 +121,7 @@ class RunFolder:
         """Replace the configuration by one of a longer run, and its hash in all rows."""
         rows = [row | {"configuration": config["configuration"]} for row in self.read("rows")]
         with disk_errors(self.path):
-            write_file(self.path / "rows.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
+            write_file(self.path / "rows.jsonl", _lines(rows).encode())
         self.create(config)
 
     def rewind(self, step: int) -> None:
@@ -130,7 +130,7 @@ class RunFolder:
             for name in LINES:
                 if (self.path / f"{name}.jsonl").is_file():
                     kept = [row for row in self.read(name) if row["step"] <= step]
-                    write_file(self.path / f"{name}.jsonl", "".join(json.dumps(row) + "\n" for row in kept).encode())
+                    write_file(self.path / f"{name}.jsonl", _lines(kept).encode())
             for later in checkpoint_folders(self.path):
                 if int(later.name) > step:
                     shutil.rmtree(_set_aside(later))
@@ -229,6 +229,11 @@ def hold(path: Path) -> Iterator[None]:
         for folder in made:  # what was refused leaves nothing
             with contextlib.suppress(OSError):
                 folder.rmdir()
+
+
+def _lines(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Write rows as JSON, one a line."""
+    return "".join(json.dumps(row) + "\n" for row in rows)
 
 
 def path_of(run: RunLike) -> Path:

@@ -15,7 +15,7 @@ from delayrl.agents.base import Agent, Phase, State, template
 from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec
 from delayrl.envs.making import make
-from delayrl.envs.task import closing
+from delayrl.envs.task import closing_quietly
 from delayrl.errors import DelayRLError, DelayWarning
 from delayrl.play import stepping
 from delayrl.play.policy import spec_of
@@ -45,15 +45,15 @@ def check_ways(ways: Ways) -> None:
         raise DelayRLError(f"callback is a function of the step and the runs; got {ways.callback!r}")
 
 
-def replay_bytes(setup: Setup, spec: Spec) -> int:
+def replay_bytes(spec: Spec, rows: int) -> int:
     """Return the size of one seed's replay."""
-    replay = jax.eval_shape(lambda: ring.init(spec, setup.replay_rows(spec)))
+    replay = jax.eval_shape(lambda: ring.init(spec, rows))
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(replay))
 
 
 def check_memory(setup: Setup, spec: Spec, seeds: int, device: str | None) -> None:
     """Raise DelayRLError for replays that the memory of this machine does not hold. An accelerator's is not known."""
-    needed, free = seeds * replay_bytes(setup, spec), free_memory()
+    needed, free = seeds * replay_bytes(spec, setup.replay_rows(spec)), free_memory()
     if needed > free and not uses_accelerator(device):
         whose = "the replay takes" if seeds == 1 else f"the replays of {seeds} seeds take"
         line = f"{whose} {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free; give a smaller"
@@ -135,7 +135,7 @@ def _check_updates(agent: Agent, spec: Spec, state: State) -> None:
 
 def check_repeats(setup: Setup) -> None:
     """Warn if an environment does not begin twice in the same way from one seed. It is made for that, and closed."""
-    with closing(make(setup.task, setup.delay.observed(), rescale=True)) as env:
+    with closing_quietly(make(setup.task, setup.delay.observed(), rescale=True)) as env:
         first, again = (_beginning(env) for _ in range(2))
     if not np.array_equal(first, again, equal_nan=True):
         why = "its reset has to call super().reset(seed=seed), its steps to draw from self.np_random alone, and its "

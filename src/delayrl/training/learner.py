@@ -37,7 +37,7 @@ class Stored(NamedTuple):
 
 
 class Program:
-    """The jitted functions of one agent on one task. Every argument but `step` has a leading seed axis.
+    """The jitted functions of one agent on one task. Learners, agents, observations and keys have a leading seed axis.
 
     Get one from `compiled`: it returns the same functions for the same agent and task.
     """

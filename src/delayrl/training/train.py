@@ -16,7 +16,7 @@ from delayrl.core.cache import keep_compiled
 from delayrl.core.precision import setting
 from delayrl.delays import DelayLike, in_other_unit
 from delayrl.envs.making import make, seconds_of
-from delayrl.envs.task import TaskLike, WrapperLike, as_task, closing
+from delayrl.envs.task import TaskLike, WrapperLike, as_task, closing_quietly
 from delayrl.play.policy import spec_of
 from delayrl.play.run import Run
 from delayrl.run.agents import AgentLike
@@ -148,7 +148,7 @@ def train_group(
     check_ways(ways)
     with ExitStack() as held:
         made = (make(setup.task, setup.delay.observed(), rescale=True) for _ in numbers)
-        envs = [held.enter_context(closing(env)) for env in made]
+        envs = [held.enter_context(closing_quietly(env)) for env in made]
         spec = spec_of(envs[0])
         check_fit(setup, envs[0])  # before anything is stored
         check_agent(setup.agent, spec)
