@@ -57,6 +57,6 @@ def test_bad_tasks(task: str, words: str) -> None:
 
 
 def test_a_task_that_does_not_say_how_long_a_step_is() -> None:
-    with pytest.raises(delayrl.DelayRLError, match=r"\(no `dt`\): give steps, or the task a `dt`; in Python"):
+    with pytest.raises(delayrl.DelayRLError, match=r"\(no `dt`\): give steps, or the task an attribute `dt` in"):
         delayrl.make("delayrl/Counter-v0", "80ms")
     assert delayrl.make("delayrl/Counter-v0", "80ms", step_seconds=0.02).delay.maximum == 4

@@ -658,6 +658,28 @@ def stamps(path: Path, made: np.ndarray, delay: np.ndarray | float) -> Path:
     return write(path, {"stamp": made, "received": made + delay})
 
 
+def test_messages_that_overtake_others_need_not_be_sorted(tmp_path: Path) -> None:
+    """A log of messages as they arrive tells what the log in the order of the stamps tells."""
+    random = np.random.default_rng(0)
+    made = 0.02 * np.arange(400)
+    delay = random.uniform(0.03, 0.09, 400)
+    arrival = np.argsort(made + delay)
+    assert (np.diff(made[arrival]) < 0).sum() > 50
+    as_they_arrive = from_log(stamps(tmp_path / "arrival.csv", made[arrival], delay[arrival]))
+    assert replace(as_they_arrive, path="") == replace(from_log(stamps(tmp_path / "sorted.csv", made, delay)), path="")
+
+
+def test_stamps_of_two_clocks_or_units(tmp_path: Path) -> None:
+    made = 0.02 * np.arange(400)
+    with pytest.raises(
+        DelayRLError, match=r"1\.7e\+09 s after it was made, or later: --stamp and --received are of two"
+    ):
+        from_log(stamps(tmp_path / "clocks.csv", made, 1.7e9))
+    late = write(tmp_path / "units.csv", {"stamp": 1e3 * (made + 9), "received": made + 9.05})
+    with pytest.raises(DelayRLError, match="swapped or in different units, or the clocks differ"):
+        from_log(late)
+
+
 def test_stamps_of_several_recordings(tmp_path: Path) -> None:
     """The clock starts again in the second; together they show what each shows alone."""
     made, delay = np.tile(ROW * np.arange(300), 2), np.tile([2.5, 3.5], 300) * ROW
@@ -905,7 +927,10 @@ def replaced(values: np.ndarray, row: int, by: object) -> list:
         ({"when": TIME, "command": COMMAND, "obs": OBS}, "no column time"),
         ({"time": TIME, "torque": COMMAND, "obs": OBS}, "--commands"),
         ({"time": TIME, "command": COMMAND, "angle": OBS}, "--observations"),
-        ({"stamp": TIME, "received": TIME - 0.1}, "--stamp and --received are swapped, or the clocks differ"),
+        (
+            {"stamp": TIME, "received": TIME - 0.1},
+            "--stamp and --received are swapped or in different units, or the clocks differ",
+        ),
         ({"stamp": TIME[::-1], "received": TIME[::-1] + 0.1}, "the stamp goes back"),
         ({"stamp": TIME[:5], "received": TIME[:5]}, "too short"),
     ],

@@ -18,6 +18,7 @@ from gymnasium.wrappers import (
 import delayrl
 from delayrl.errors import DelayWarning
 from delayrl.wrappers import AugmentedObservation, Delayed
+from delayrl.wrappers.layers import check_spaces, seconds_of
 
 
 def rollout(env: gym.Env, steps: int, seed: int = 0) -> tuple[list, list, list]:
@@ -145,6 +146,24 @@ def test_images_and_unbounded_actions() -> None:
         Delayed(Images(), 1)
     with pytest.raises(delayrl.DelayRLError, match="bounded"):
         Delayed(Unbounded(), 1)
+
+
+def test_what_an_environment_must_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refusals say what to do instead; a step in milliseconds is noticed by the frames."""
+    monkeypatch.setattr("delayrl.wrappers.layers._warned", set())
+    numbers, actions = gym.spaces.Box(-1, 1, (3,)), gym.spaces.Box(-1, 1, (2,))
+    cases = [
+        (gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), actions, "nothing here learns from images; observe the pose"),
+        (numbers, gym.spaces.Discrete(4), r"got Discrete\(4\): let the environment take a Box"),
+        (numbers, gym.spaces.Box(-np.inf, np.inf, (2,)), "give the actuators' limits"),
+    ]
+    for observations, given, words in cases:
+        with pytest.raises(delayrl.DelayRLError, match=words):
+            check_spaces("Dog", observations, given)
+    env = gym.make("Pendulum-v1").unwrapped
+    env.dt, env.metadata = 50, {"render_fps": 20}
+    with pytest.warns(DelayWarning, match="takes 50 s by its dt, and its render_fps says 0.05 s: dt is in seconds"):
+        assert seconds_of(env) == 50
 
 
 def test_an_episode_in_which_nothing_is_observed(monkeypatch) -> None:

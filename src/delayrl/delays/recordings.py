@@ -88,7 +88,9 @@ def in_steps(number: float, unit: str, step_seconds: float | None) -> float:
     if step_seconds is not None and (not isinstance(step_seconds, Real) or not 0 < step_seconds < math.inf):
         raise DelayRLError(f"step_seconds is the seconds of a step, a number above 0; got {step_seconds!r}")
     if step_seconds is None:
-        hint = "give steps, or the task a `dt`; in Python, `make` and the wrappers take step_seconds"
+        hint = (
+            "give steps, or the task an attribute `dt` in seconds; in Python, give step_seconds to `make` or a wrapper"
+        )
         raise DelayRLError(f"the task does not say how long a step is (no `dt`): {hint}")
     return number * {"s": 1.0, "ms": 1e-3}[unit] / step_seconds
 

@@ -19,8 +19,9 @@ def by_stamps(
     `period` is that of control and `warm_up` what is left out at the start, both in seconds, or None for the defaults
     of `from_log`. Raises DelayRLError if the stamps cannot be right, or are too few.
     """
-    delays, inside = arrived - made, episode[1:] == episode[:-1]
-    _check_order(path, made, delays, inside)
+    inside = episode[1:] == episode[:-1]
+    made, arrived = _in_order(path, made, arrived, episode, inside)
+    delays = arrived - made
     start, first, row_spacing = _one_clock(path, made, inside)
     made, delays = made[0] + start, delays[first]
     warm = reading.WARM_UP * float(start[-1]) if warm_up is None else warm_up
@@ -53,17 +54,27 @@ def by_stamps(
     )
 
 
-def _check_order(path: Path, made: Array, delays: Array, inside: Mask) -> None:
-    """Raise DelayRLError for a stamp before that of the row above, or after the observation arrived."""
-    if (back := inside & (np.diff(made) < 0)).any():
+def _in_order(path: Path, made: Array, arrived: Array, episode: Array, inside: Mask) -> tuple[Array, Array]:
+    """Return both times in the order of the stamps: some messages may have overtaken others of their recording.
+
+    Raises DelayRLError for a stamp that goes back as only another recording's does, and for two clocks or units.
+    """
+    delays, gaps = arrived - made, np.diff(made)
+    spacing = float(np.median(gaps[inside & (gaps > 0)])) if (inside & (gaps > 0)).any() else 0.0
+    if (back := inside & (gaps < -reading.GAP * spacing)).any():
         hint = "sort the rows by when observations were made, or name a column with --episode that changes where a new "
         raise DelayRLError(f"{path}, row {int(np.argmax(back)) + 2}: the stamp goes back; {hint}recording begins")
     if delays.min() < 0:
         row = int(np.argmin(delays))
         hint = "the clocks differ by at least that; synchronise them (PTP, NTP), or stamp both ends with one clock"
         if delays.max() < 0:
-            hint = "--stamp and --received are swapped, or " + hint
+            hint = "--stamp and --received are swapped or in different units, or " + hint
         raise DelayRLError(f"{path}, row {row + 1}: arrived {-delays[row]:.6g} s before it was made: {hint}")
+    if delays.min() > max(10, 1000 * spacing):
+        late = f"every observation arrived {delays.min():.6g} s after it was made, or later"
+        raise DelayRLError(f"{path}: {late}: --stamp and --received are of two clocks, or in different units")
+    order = np.lexsort((made, episode))
+    return made[order], arrived[order]
 
 
 def _one_clock(path: Path, made: Array, inside: Mask) -> tuple[Array, Mask, float]:

@@ -14,6 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, DelayWarning
 
+INSTEAD = "let the environment take a Box of floats, and round inside"
 PACKAGE = str(Path(__file__).parents[1])
 _warned: set[str] = set()
 REPEATS = {"RepeatAction": "num_repeats", "MaxAndSkipObservation": "_skip"}
@@ -30,11 +31,20 @@ def seconds_of(env: Any) -> float | None:
     for layer, steps in _layers_with_steps(env):
         for seconds in (getattr(layer, "dt", None), getattr(layer, "tau", None) if layer is env.unwrapped else None):
             if isinstance(seconds, int | float | np.number) and seconds > 0:
+                _check_unit(env, layer, float(seconds))
                 return float(seconds) * steps
         if (dt := getattr(layer, "dt", None)) is not None:
             shown = "a method" if callable(dt) else f"{dt!r:.60}"
             warn_once(f"{name_of(env)}: its dt is {shown}, not seconds above 0, and is not used")
     return None
+
+
+def _check_unit(env: Any, layer: Any, dt: float) -> None:
+    """Warn of a step that is far longer than the frames of the environment are apart: it may be in milliseconds."""
+    frames = (getattr(layer, "metadata", None) or {}).get("render_fps")
+    if isinstance(frames, int | float) and dt > 1 and dt * frames >= 100:
+        line = f"a step of {name_of(env)} takes {dt:g} s by its dt, and its render_fps says {1 / frames:.2g} s"
+        warn_once(f"{line}: dt is in seconds")
 
 
 def layers_of(env: Any) -> Iterator[Any]:
@@ -62,13 +72,17 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
         hint = (
             ": gymnasium.wrappers.FlattenObservation, or flatten=True (--flatten) here, makes one of it" if flat else ""
         )
+        if isinstance(observations, Box) and observations.dtype == np.uint8 and len(observations.shape) > 1:
+            hint = ": nothing here learns from images; observe the pose that is computed from them"
         raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}{hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
-        raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}")
+        raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}: {INSTEAD}")
     if not actions.shape[0]:
         raise DelayRLError(f"{name}: there must be an action; got {actions}")
     if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
-        raise DelayRLError(f"{name}: actions must be bounded, with low < high; got {actions}")
+        raise DelayRLError(
+            f"{name}: actions must be bounded, with low < high; got {actions}: give the actuators' limits"
+        )
 
 
 def limit_of(env: Any) -> int | None:
