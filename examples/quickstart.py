@@ -11,7 +11,7 @@ with tempfile.TemporaryDirectory() as folder:
     run = delayrl.train(
         "a-sac", "delayrl/Walk-v0", delay=3, preset="small", steps=2_000, random_steps=500, hidden=(64, 64), out=folder
     )
-    policy = delayrl.load(run.path)
+    policy = delayrl.load(run)
 
 env = delayrl.make("delayrl/Walk-v0", delay=3)
 obs, info = env.reset(seed=0)

@@ -1,5 +1,7 @@
 """What a user with a strict type checker writes. `make check` runs mypy on this file, as on the library."""
 
+import subprocess
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -68,7 +70,10 @@ def test_modules_are_found_and_listed() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'trian'"):
         delayrl.trian  # type: ignore[attr-defined]  # noqa: B018
     assert {"load_bundle", "adapt", "Controller"} <= set(dir(delayrl.deploy))
-    assert delayrl.deploy.Controller is Controller
+    code = "import delayrl; print(delayrl.deploy.Controller.__name__, delayrl.wrappers.Delayed.__name__)"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.split() == [delayrl.deploy.Controller.__name__, delayrl.wrappers.Delayed.__name__]
+    assert delayrl.delays.as_delay(3) == Delay(3)
 
 
 def test_a_missing_extra_is_an_import_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,13 +5,15 @@ run. JAX is imported only when training or a policy is asked for: `delayrl.wrapp
 Importing delayrl registers its tasks: `gymnasium.make("delayrl/Ant-v4")`.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from delayrl.envs.registration import watch_gymnasium
 from delayrl.errors import import_later
 
 if TYPE_CHECKING:
+    from delayrl import delays as delays
+    from delayrl import deploy as deploy
+    from delayrl import wrappers as wrappers
     from delayrl.agents.registry import AGENTS as AGENTS
     from delayrl.delays import Delay as Delay
     from delayrl.delays import as_delay as as_delay
@@ -59,8 +61,8 @@ _HOME = {
     "train": "training.train",
     "watch": "play.video",
 }
-_PACKAGES = ("batched", "bench", "delays", "deploy", "measure", "report", "wrappers")
-"""What pages of the documentation import from besides."""
+_PACKAGES = {"delays": "", "deploy": "", "wrappers": ""}
+"""Packages that need no import of their own."""
 __all__ = sorted(_HOME)
 
 watch_gymnasium()
@@ -73,4 +75,4 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # else a checker takes every name for one of ours
 
     def __getattr__(name: str) -> Any:
-        return import_module(f"{__name__}.{name}") if name in _PACKAGES else import_later(__name__, _HOME, name)
+        return import_later(__name__, _HOME | _PACKAGES, name)

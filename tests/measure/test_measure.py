@@ -669,6 +669,20 @@ def test_messages_that_overtake_others_need_not_be_sorted(tmp_path: Path) -> Non
     assert replace(as_they_arrive, path="") == replace(from_log(stamps(tmp_path / "sorted.csv", made, delay)), path="")
 
 
+def test_overtaken_messages_stay_in_their_recording(tmp_path: Path) -> None:
+    """Whatever the recordings are called. A clock that restarts without a name is refused, however short they are."""
+    made = np.append(0.02 * np.arange(300), 0.02 * np.arange(200))
+    delay, found = np.repeat([0.05, 0.07], [300, 200]), []
+    for parts in ([0, 1], [1, 0]):
+        columns = {"stamp": made, "received": made + delay, "episode": np.repeat(parts, [300, 200])}
+        found.append(replace(from_log(write(tmp_path / "log.csv", columns)), path=""))
+    assert found[0] == found[1]
+    assert found[0].train_with == "uniform:2:4"
+    short = np.tile(0.02 * np.arange(18), 30)
+    with pytest.raises(DelayRLError, match="row 19: the stamp goes back"):
+        from_log(stamps(tmp_path / "short.csv", short, 0.05))
+
+
 def test_stamps_of_two_clocks_or_units(tmp_path: Path) -> None:
     made = 0.02 * np.arange(400)
     with pytest.raises(

@@ -162,7 +162,7 @@ def test_what_an_environment_must_have(monkeypatch: pytest.MonkeyPatch) -> None:
             check_spaces("Dog", observations, given)
     env = gym.make("Pendulum-v1").unwrapped
     env.dt, env.metadata = 50, {"render_fps": 20}
-    with pytest.warns(DelayWarning, match="takes 50 s by its dt, and its render_fps says 0.05 s: dt is in seconds"):
+    with pytest.warns(DelayWarning, match="takes 50 s by its dt or tau, and its render_fps says 0.05 s"):
         assert seconds_of(env) == 50
 
 

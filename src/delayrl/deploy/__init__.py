@@ -26,11 +26,10 @@ LATER = {"Bundle": "bundle", "load_bundle": "bundle", "export_run": "export"} | 
     ("AdaptedPolicy", "adapt", "export_layers", "stable_baselines_layers"), "adapter"
 )
 """Names that are imported when they are asked for, and their modules."""
-__all__ = sorted([*LATER, "ClockError", "ControlPolicy", "Controller", "OverrunError", "Statistics"])
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted([*globals(), *LATER])
 
 
 if not TYPE_CHECKING:  # else a checker takes every name for one of ours

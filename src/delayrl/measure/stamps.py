@@ -20,7 +20,7 @@ def by_stamps(
     of `from_log`. Raises DelayRLError if the stamps cannot be right, or are too few.
     """
     inside = episode[1:] == episode[:-1]
-    made, arrived = _in_order(path, made, arrived, episode, inside)
+    made, arrived = _in_order(path, made, arrived, inside)
     delays = arrived - made
     start, first, row_spacing = _one_clock(path, made, inside)
     made, delays = made[0] + start, delays[first]
@@ -54,14 +54,15 @@ def by_stamps(
     )
 
 
-def _in_order(path: Path, made: Array, arrived: Array, episode: Array, inside: Mask) -> tuple[Array, Array]:
+def _in_order(path: Path, made: Array, arrived: Array, inside: Mask) -> tuple[Array, Array]:
     """Return both times in the order of the stamps: some messages may have overtaken others of their recording.
 
     Raises DelayRLError for a stamp that goes back as only another recording's does, and for two clocks or units.
     """
     delays, gaps = arrived - made, np.diff(made)
     spacing = float(np.median(gaps[inside & (gaps > 0)])) if (inside & (gaps > 0)).any() else 0.0
-    if (back := inside & (gaps < -reading.GAP * spacing)).any():
+    far = (gaps < -reading.GAP * spacing) | (np.diff(arrived) < 0)  # who was overtaken arrived later, and not long ago
+    if (back := inside & (gaps < 0) & far).any():
         hint = "sort the rows by when observations were made, or name a column with --episode that changes where a new "
         raise DelayRLError(f"{path}, row {int(np.argmax(back)) + 2}: the stamp goes back; {hint}recording begins")
     if delays.min() < 0:
@@ -73,7 +74,7 @@ def _in_order(path: Path, made: Array, arrived: Array, episode: Array, inside: M
     if delays.min() > max(10, 1000 * spacing):
         late = f"every observation arrived {delays.min():.6g} s after it was made, or later"
         raise DelayRLError(f"{path}: {late}: --stamp and --received are of two clocks, or in different units")
-    order = np.lexsort((made, episode))
+    order = np.lexsort((made, np.append(0, np.cumsum(~inside))))
     return made[order], arrived[order]
 
 
@@ -83,9 +84,8 @@ def _one_clock(path: Path, made: Array, inside: Mask) -> tuple[Array, Mask, floa
     Each recording begins a pause after the one before, whatever its clock says. All times are in seconds.
     """
     gaps = np.diff(made)
-    first = np.append(
-        True, ~inside | (gaps > 0)
-    )  # a row of the control loop may show the observation of the row before
+    # a row of the control loop may show the observation of the row before
+    first = np.append(True, ~inside | (gaps > 0))
     if first.sum() < 10:
         raise DelayRLError(f"{path} has {first.sum()} different stamps: too short, at least 10 are needed")
     spacing = float(np.median(gaps[inside & (gaps > 0)]))

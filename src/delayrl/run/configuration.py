@@ -108,7 +108,7 @@ def check_names(values: Iterable[str], *configs: Any) -> None:
     known = [option.name for config in configs for option in options(config)]
     for name in values:
         if name not in known:
-            near = near_names(name, [*known, *sorted(TAKEN)])
+            near = near_names(name, [*known, *sorted(TAKEN - {name})])
             hint = did_you_mean(near, "`delayrl train AGENT --help` lists them")
             raise DelayRLError(f"unknown hyperparameter {name!r}{hint}")
 

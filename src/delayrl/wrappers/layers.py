@@ -42,9 +42,9 @@ def seconds_of(env: Any) -> float | None:
 def _check_unit(env: Any, layer: Any, dt: float) -> None:
     """Warn of a step that is far longer than the frames of the environment are apart: it may be in milliseconds."""
     frames = (getattr(layer, "metadata", None) or {}).get("render_fps")
-    if isinstance(frames, int | float) and dt > 1 and dt * frames >= 100:
-        line = f"a step of {name_of(env)} takes {dt:g} s by its dt, and its render_fps says {1 / frames:.2g} s"
-        warn_once(f"{line}: dt is in seconds")
+    if isinstance(frames, int | float | np.number) and dt > 1 and 100 <= dt * frames < np.inf:
+        line = f"a step of {name_of(env)} takes {dt:g} s by its dt or tau, and its render_fps says {1 / frames:.2g} s"
+        warn_once(f"{line}: a step is given in seconds")
 
 
 def layers_of(env: Any) -> Iterator[Any]:
