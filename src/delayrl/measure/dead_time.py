@@ -46,7 +46,7 @@ def by_correlation(
     delay, steps = (first - 1) * row, tuple(rounded_up_steps(d, period) for _, d in windows)
     spread = [d for _, d in windows] if len(windows) > 1 else [delay]
     fewest, most = np.quantile([rounded_up_steps(d, period) for d in spread], (0.1, 0.9), method="nearest")
-    shortest, longest = np.quantile(spread, (0.1, 0.9))
+    shortest, slowest = np.quantile(spread, (0.1, 0.9))
     return Estimated(
         method="correlation",
         path=str(path),
@@ -59,7 +59,7 @@ def by_correlation(
         warm_up=warm,
         steps=steps,
         step=rounded_up_steps(delay, period),
-        span=(float(shortest), float(longest) + row),
+        span=(float(shortest), float(slowest) + row),
         step_span=(int(fewest), int(most)),
         strength=float(strength.max()),
         peak=pairs[0],
