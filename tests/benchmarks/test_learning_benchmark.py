@@ -84,7 +84,7 @@ def test_options_on_the_command_line_are_values(tmp_path: Path, monkeypatch: pyt
     assert json.loads(file.read_text().splitlines()[0])["config"]["set"] == words
 
 
-REFERENCE = Anchor(np.full(2, 3900.0), np.zeros(2))
+REFERENCE = Anchor(np.full(2, 3900.0), np.zeros(2), "sac, no delay")
 
 
 def result(agent: str, delay: int, returns: list[list[float]], **overrides: float) -> Result:
