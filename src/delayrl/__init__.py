@@ -5,6 +5,7 @@ run. JAX is imported only when training or a policy is asked for: `delayrl.wrapp
 Importing delayrl registers its tasks: `gymnasium.make("delayrl/Ant-v4")`.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from delayrl.envs.registration import watch_gymnasium
@@ -61,7 +62,7 @@ _HOME = {
     "train": "training.train",
     "watch": "play.video",
 }
-_PACKAGES = {"delays": "", "deploy": "", "wrappers": ""}
+_PACKAGES = ("delays", "deploy", "wrappers")
 """Packages that need no import of their own."""
 __all__ = sorted(_HOME)
 
@@ -75,4 +76,4 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # else a checker takes every name for one of ours
 
     def __getattr__(name: str) -> Any:
-        return import_later(__name__, _HOME | _PACKAGES, name)
+        return import_module(f"{__name__}.{name}") if name in _PACKAGES else import_later(__name__, _HOME, name)

@@ -49,12 +49,11 @@ def needs_extra(error: BaseException) -> MissingExtraError | None:
 
 
 def import_later(package: str, homes: Mapping[str, str], name: str) -> Any:
-    """Return a name of a package from the module that has it, for `__getattr__`: `homes` says which; "": it is one."""
+    """Return a name of a package from the module that has it, for `__getattr__`: `homes` says which."""
     if name not in homes:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
     try:
-        home = homes[name]
-        return getattr(import_module(f"{package}.{home}"), name) if home else import_module(f"{package}.{name}")
+        return getattr(import_module(f"{package}.{homes[name]}"), name)
     except ModuleNotFoundError as error:
         raise (needs_extra(error) or error) from error
 

@@ -207,6 +207,7 @@ def evaluate(
     Raises:
         DelayRLError: no run, no good checkpoint, a delay that the policy was not trained for.
     """
+    _check_sample(episodes, seed)
     policy, task = _loaded(run, env, env_kwargs, agent)
     if delay is not None and (played := delay_of(task, delay)).minimum < policy.min_age:
         line = (
@@ -238,13 +239,19 @@ def sweep(
     Raises:
         DelayRLError: as `evaluate`.
     """
+    _check_sample(episodes, seed)
     policy, task = _loaded(run, env, env_kwargs, agent)
-    _check_number(episodes)
-    check_seed(seed)
     return (
         {**_play(policy, task, delay, episodes, seed), "learned": delay >= policy.min_age}
         for delay in range(policy.spec.delay + 1)
     )
+
+
+def _check_sample(episodes: int, seed: int) -> None:
+    """Raise DelayRLError unless there is an episode to play, and the seed is one."""
+    if not isinstance(episodes, int | np.integer) or episodes < 1:
+        raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
+    check_seed(seed)
 
 
 def _loaded(
@@ -261,15 +268,7 @@ def _loaded(
     return run, as_task(task, env_kwargs)
 
 
-def _check_number(episodes: int) -> None:
-    """Raise DelayRLError unless a number of episodes is a whole number from 1 on."""
-    if not isinstance(episodes, int | np.integer) or episodes < 1:
-        raise DelayRLError(f"episodes must be a whole number, at least 1; got {episodes!r}")
-
-
 def _play(policy: Policy, task: Task, delay: DelayLike, episodes: int, seed: int) -> Evaluation:
-    _check_number(episodes)
-    check_seed(seed)
     parsed = delay_of(task, delay)
     states = jax.tree.map(lambda x: np.asarray(x)[None], policy.state)
     seeds = [reset_seed(seed, HELD_OUT, episode) for episode in range(episodes)]
