@@ -304,7 +304,7 @@ def main() -> None:
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("any-age-ladder", "any-age-crossq")]
     arms, goals = ladder.sections([file for file in rows if file.exists()], images / "ladder.png")
     insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
-    insert(root / "docs" / "algorithms" / "any-age.md", "goals", goals)
+    insert(root / "docs" / "algorithms" / "any-age-trials.md", "goals", goals)
     usual, every = (HERE / "results" / f"halfcheetah-ages{name}.jsonl" for name in ("", "-any"))
     title, wide = "HalfCheetah-v5, trained under uniform:1:25, five seeds", "any-age second_age=any"
     played = sweeps.read(usual) | {wide: sweeps.read(every)["any-age"]}
@@ -318,7 +318,7 @@ def main() -> None:
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)
-    insert(root / "docs" / "which-agent.md", "lost", lost.section(rows, images / "lost.png"))
+    insert(root / "docs" / "benchmarks.md", "lost", lost.section(rows, images / "lost.png"))
     insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
     text = times.section(HERE / "results" / "times", images / "times.png")
     insert(root / "docs" / "performance.md", "times", text)

@@ -15,7 +15,7 @@ from delayrl.report.statistics import FEWEST, improvement_interval
 from delayrl.report.summary import summarise
 from delayrl.report.wording import number
 
-HEAD = ("case", "highest return", "no clear difference from it", "lower", "not finished")
+HEAD = ("case", "highest return", "not shown to be lower", "lower", "not finished")
 BUDGET = {"precision", "steps", "evaluate_every", "random_steps", "replay_capacity", "tokens"}
 """Overrides that leave an agent what it is."""
 WAITING = "@wait"

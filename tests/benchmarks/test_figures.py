@@ -52,7 +52,7 @@ def test_the_result(tmp_path: Path) -> None:
     assert section("README.md", "result") == section("docs/index.md", "result") == result
     arms, goals = figures.ladder.sections(tables("any-age-ladder"), tmp_path / "ladder.png")
     assert section("docs/algorithms/any-age.md", "ladder") == arms
-    assert section("docs/algorithms/any-age.md", "goals") == goals
+    assert section("docs/algorithms/any-age-trials.md", "goals") == goals
 
 
 @pytest.mark.thorough
@@ -61,5 +61,5 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/algorithms/any-age.md", "against") == figures.against.section(rows)
     poles = figures.against.section(rows, "InvertedDoublePendulum-v5")
     assert section("docs/algorithms/any-age.md", "against-poles") == poles
-    assert section("docs/which-agent.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
+    assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
     assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])
