@@ -173,14 +173,16 @@ def costs(env: str, delays: tuple[int, ...]) -> str:
 
 def relative_costs(env: str, delays: tuple[int, ...]) -> str:
     """Return a Markdown table of the arithmetic of each late agent's updates over BPQL's, with the preset `matched`."""
-    known = {a: [matched(a, env, delay) for delay in delays] for a in AGENTS if a not in ("random", "sac")}
+    known = {f"`{a}`": [matched(a, env, delay) for delay in delays] for a in AGENTS if a not in ("random", "sac")}
+    known["`vdpo`, `tokens=1280`"] = [matched("vdpo", env, delay, tokens=1280) for delay in delays]
     body = []
-    for agent, own in sorted(known.items(), key=lambda item: item[1][-1][1].flops):
+    for label, own in sorted(known.items(), key=lambda item: item[1][-1][1].flops):
         mark = " †" if own[-1][0].privileged else ""
-        pairs = zip(own, known["bpql"], strict=True)
-        body.append([f"`{agent}`{mark}", *(f"{cost.flops / base.flops:.1f}" for (_, cost), (_, base) in pairs)])
+        pairs = zip(own, known["`bpql`"], strict=True)
+        body.append([f"{label}{mark}", *(f"{cost.flops / base.flops:.1f}" for (_, cost), (_, base) in pairs)])
     table = markdown_table(["agent", *(f"Δ = {delay}" for delay in delays)], body)
-    return f"{table}\n\n{env}. DIDA's is a mean over its expert's steps and its student's."
+    rest = "DIDA's is a mean over its expert's steps and its student's. The results on this page have `tokens=1280`."
+    return f"{table}\n\n{env}. {rest}"
 
 
 def udp_table(lines: list[dict[str, Any]]) -> str:

@@ -55,7 +55,7 @@ def section(files: list[Path], pictures: Path) -> str:
     shown = [result.condition for result in chosen.values()]
     runs = itertools.chain(*map(trained_with, files))
     used = [versions for condition, _, own in runs if condition in shown for versions in own]
-    *others, last = (f"{count:,} steps on {short(env)}" for env, count in STEPS.items())
+    *others, last = (f"{count:,} steps on {env}" for env, count in STEPS.items())
     steps = f"{', '.join(others)} and {last}"
     made = (
         f"Δ is the delay in steps. Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other "
@@ -116,7 +116,7 @@ def table(chosen: Chosen, marked: Collection[tuple[str, Case]] = ()) -> str:
         known = [arm for arm in (label, label.partition(",")[0]) if (arm, CASES[1]) in chosen]
         return -chosen[known[0], CASES[1]].curves.final.mean() if known else np.inf, label
 
-    head = ["", *(f"{short(env)}, Δ = {delay}" for env, delay in CASES)]
+    head = ["", *(f"{env}, Δ = {delay}" for env, delay in CASES)]
     labels = sorted(dict.fromkeys(label for label, _ in chosen), key=rank)
     places = [[(label, case) for case in CASES] for label in labels]
     cells = [[cell(chosen.get(place), " °" if place in marked else "") for place in row] for row in places]
