@@ -96,7 +96,7 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
     import jax
 
     import delayrl
-    from delayrl.cli.console import pair
+    from delayrl.cli.console import name_and_value
     from delayrl.training.recorder import Recorder
 
     evaluate = Recorder.evaluate
@@ -112,7 +112,7 @@ def ours(given: argparse.Namespace, clock: Clock, record: Record) -> None:
         rows = [row for row in runs[0].rows() if row["step"] == step and row["policy"] == "agent"]
         return record(step, float(np.mean([row["return"] for row in rows])))
 
-    options = dict(map(pair, given.set))
+    options = dict(map(name_and_value, given.set))
     with tempfile.TemporaryDirectory() as folder:
         delayrl.train(
             given.side,

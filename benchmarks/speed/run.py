@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from works import SIZES, WORKS, Work
 
-from delayrl.cli.console import pair
+from delayrl.cli.console import name_and_value
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results" / "speed.jsonl"
@@ -310,7 +310,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--most", type=int, default=41, help="at most this many slices per side")
     parser.add_argument("--seconds", type=float, help="continue beyond --rounds for this long (30; 3 with --sizes)")
     parser.add_argument("--steps", type=int, help="environment steps of a slice")
-    parser.add_argument("--set", type=pair, action="append", default=[], metavar="NAME=VALUE", help="set our option")
+    parser.add_argument(
+        "--set", type=name_and_value, action="append", default=[], metavar="NAME=VALUE", help="set our option"
+    )
     parser.add_argument("--no-floor", action="store_true", help="skip parts and floor")
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()

@@ -320,3 +320,15 @@ def test_the_preset_matched_is_traced_as_a_run_begins() -> None:
     """With the checks of types and shapes, which are the tests' own; its temperature is learned."""
     agent, spec = AGENTS["dcac"].presets["matched"].agent, Spec(10, 2, 3)
     check_agent(agent, spec)
+
+
+def test_a_batch_without_a_step_leaves_a_learned_temperature() -> None:
+    """Under delays that can be 0 a window may have no step to sum, and then it shows no entropy."""
+    agent = dataclasses.replace(AGENT, temperature="learned")
+    windows = counter("truncated")
+    fresh = dataclasses.replace(windows, age=jnp.zeros_like(windows.age))
+    state = agent.init(COUNTER, jax.random.key(1))
+    for batch, moves in ((fresh, False), (windows, True)):
+        after, metrics = jax.jit(agent.update)(state, batch, jax.random.key(2), jnp.int32(0))
+        assert (metrics["target_steps"] > 0) == moves
+        assert (after.log_temperature != state.log_temperature) == moves

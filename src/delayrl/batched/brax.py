@@ -148,8 +148,8 @@ class DelayWrapper(Wrapper):  # type: ignore[misc]  # brax has no types
         """Issue actions, [N, A]. Where an episode ends, the next one is shown, as brax's own wrapper does it."""
         info = dict(state.info)
         messages = info.pop(NAME)
-        episodes, applied = jax.vmap(act, (self._axes, 0, 0))(self.delay, messages.episodes, action)
-        state = self.env.step(state.replace(obs=messages.obs, info=info), applied)
+        episodes, acting = jax.vmap(act, (self._axes, 0, 0))(self.delay, messages.episodes, action)
+        state = self.env.step(state.replace(obs=messages.obs, info=info), acting)
         obs, done = self._late(state.obs), state.done > 0
         receive = jax.vmap(arrive, (self._axes, 0, 0, 0, 0, 0))
         episodes, shown = receive(self.delay, episodes, obs, state.reward, done, jnp.zeros_like(done))

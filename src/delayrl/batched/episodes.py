@@ -61,8 +61,8 @@ def act(
     """Issue an action. Returns the one that acts now, which the simulator takes."""
     key, now = jax.random.split(episode.key)
     travel, state = _draw(delay.action, episode.laws.action, now)
-    transit, applied = issue(delay, episode.transit, action, travel)
-    return Episode(transit, episode.laws._replace(action=state), key), applied
+    transit, acting = issue(delay, episode.transit, action, travel)
+    return Episode(transit, episode.laws._replace(action=state), key), acting
 
 
 def arrive(

@@ -100,13 +100,13 @@ def issue(
     delay: BatchedDelay, transit: Transit, action: Float[Array, " action"], travel: Int[Array, ""]
 ) -> tuple[Transit, Float[Array, " action"]]:
     """Issue an action. Returns the one that acts now."""
-    now, applied = transit.time, action
+    now, acting = transit.time, action
     if delay.action.maximum:
         queue = _send(delay.action, transit.action, now, travel)
         age = jnp.minimum(now - queue.newest, delay.action.maximum)
-        applied = jnp.where(age > 0, _issued(transit, now - age), action)
+        acting = jnp.where(age > 0, _issued(transit, now - age), action)
         transit = transit._replace(action=queue, action_age=age)
-    return transit._replace(actions=transit.actions.at[now % len(transit.actions)].set(action)), applied
+    return transit._replace(actions=transit.actions.at[now % len(transit.actions)].set(action)), acting
 
 
 def receive(

@@ -213,10 +213,7 @@ def _insert_run(table: sqlite3.Connection, cell: Cell, path: Path, seed: int, ro
     for row in rows:
         more = {k: v for k, v in row.items() if k not in EPISODE and k not in shared}
         values = (run, *(row[name] for name in EPISODE), _json(more) if more else None)
-        try:
-            table.execute("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
-        except sqlite3.IntegrityError as error:
-            raise DelayRLError(f"{path} holds an episode twice: step {row['step']}, {row['policy']}") from error
+        table.execute("INSERT INTO rows VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
     return len(rows)
 
 

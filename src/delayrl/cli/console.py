@@ -42,7 +42,9 @@ class Parser(argparse.ArgumentParser):
 def add_env_kwargs(parser: argparse._ActionsContainer) -> None:
     """Add `--env-kwargs`, which gives pairs of a name and a value."""
     words = "keyword arguments of the environment; values as in JSON or Python, else text"
-    parser.add_argument("--env-kwargs", nargs="+", action="extend", type=pair, default=[], metavar="NAME=V", help=words)
+    parser.add_argument(
+        "--env-kwargs", nargs="+", action="extend", type=name_and_value, default=[], metavar="NAME=V", help=words
+    )
 
 
 def add_wrappers(parser: argparse._ActionsContainer) -> None:
@@ -63,7 +65,7 @@ DEEPEST = 500
 """Opening brackets in the value of a keyword argument, which may all lie in one another."""
 
 
-def pair(word: str) -> tuple[str, Any]:
+def name_and_value(word: str) -> tuple[str, Any]:
     """Return name and value of a word such as `gain=2`. Raises DelayRLError if it is none.
 
     A value is what JSON or Python reads (`true`, `True`, `.5`), else text: a text "False" would be true.

@@ -44,9 +44,6 @@ class Comparison(NamedTuple):
         return self._replace(one=self.other, other=self.one, probability=chance, difference=apart, runs=(other, one))
 
 
-Pair = tuple[Result, Result]
-
-
 def make_comparisons(results: Iterable[Result]) -> list[Comparison]:
     """Compare each two learners, by their seeds that have ended, in the order of their labels."""
     ended: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
@@ -69,13 +66,13 @@ def make_comparisons(results: Iterable[Result]) -> list[Comparison]:
     return comparisons
 
 
-def _probability(pairs: Sequence[Pair]) -> Estimate:
+def _probability(pairs: Sequence[tuple[Result, Result]]) -> Estimate:
     finals = [(one.curves.final, other.curves.final) for one, other in pairs]
     value = np.mean([statistics.probability_of_improvement(*pair) for pair in finals])
     return Estimate(float(value), *statistics.improvement_interval(finals))
 
 
-def _difference(pairs: Sequence[Pair]) -> Estimate:
+def _difference(pairs: Sequence[tuple[Result, Result]]) -> Estimate:
     value = float(np.mean([one.final.mean() - other.final.mean() for one, other in pairs]))
     if np.isnan(value) or min(result.runs for pair in pairs for result in pair) < statistics.FEWEST:
         return Estimate(value)

@@ -22,20 +22,8 @@ Key = tuple[Any, ...]
 """The columns of a condition, then the hash of its options, which is None in rows of version 0.1."""
 
 
-@dataclass(slots=True)
-class Evaluation:
-    """Returns of one policy at one step of a run: their sum, and the episodes that it is of."""
-
-    total: float = 0.0
-    episodes: set[int] = field(default_factory=set)
-
-    def __len__(self) -> int:
-        return len(self.episodes)
-
-    @property
-    def mean(self) -> float:
-        """The mean return."""
-        return self.total / len(self)
+Returns = dict[int, float]
+"""The returns of one policy's evaluation at one step of a run, by episode."""
 
 
 @dataclass
@@ -48,8 +36,8 @@ class RowGroup:
     privileged: bool  # whether the agent's behaviour reads the true state while it trains
     config: Mapping[str, Any] = field(default_factory=dict)  # of its runs, where it is known
     physics: set[tuple[str, str]] = field(default_factory=set)  # MuJoCo's version, and the model's fingerprint under it
-    curves: dict[tuple[str, int], dict[int, Evaluation]] = field(
-        default_factory=lambda: defaultdict(lambda: defaultdict(Evaluation))
+    curves: dict[tuple[str, int], dict[int, Returns]] = field(
+        default_factory=lambda: defaultdict(lambda: defaultdict(dict))
     )
 
     @property
@@ -65,12 +53,12 @@ class RowGroup:
     @property
     def rows(self) -> int:
         """How many rows the group has."""
-        return sum(len(evaluation.episodes) for curve in self.curves.values() for evaluation in curve.values())
+        return sum(len(returns) for curve in self.curves.values() for returns in curve.values())
 
     def runs(self, policy: str) -> dict[int, dict[int, float]]:
         """Return the mean return of a policy by seed and step, without evaluations that a crash cut off."""
         return {
-            seed: {step: curve[step].mean for step in whole_evaluations(curve)}
+            seed: {step: _mean(curve[step]) for step in whole_evaluations(curve)}
             for (name, seed), curve in self.curves.items()
             if name == policy
         }
@@ -90,19 +78,23 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
                 raise ValueError
             if key not in groups:
                 groups[key] = _group(row)
-            evaluation = groups[key].curves[policy, seed][step]
+            returns = groups[key].curves[policy, seed][step]
         except KeyError as error:
             raise DelayRLError(f"row {number} of the results has no column {error}") from None
         except (TypeError, ValueError, OverflowError, AttributeError, DelayRLError):
             raise DelayRLError(f"row {number} of the results is damaged: {str(row)[:200]}") from None
-        if episode in evaluation.episodes:
+        if episode in returns:
             place = f"{groups[key].condition}, seed {seed}, step {step}, episode {episode}"
             raise DelayRLError(f"row {number} of the results is there twice: {place}; give every file of rows once")
         if row.get("physics") is not None:
             groups[key].physics.add((str(row.get("mujoco")), str(row["physics"])))
-        evaluation.total += value
-        evaluation.episodes.add(episode)
+        returns[episode] = value
     return list(groups.values())
+
+
+def _mean(returns: Returns) -> float:
+    """Return the mean, rounded once: the same with any Python, and finite however large the returns are."""
+    return math.fsum(value / len(returns) for value in returns.values())
 
 
 def _group(row: Mapping[str, Any]) -> RowGroup:

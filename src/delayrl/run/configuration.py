@@ -78,11 +78,11 @@ class Option:
         return int(value)
 
 
-def options(config: Any) -> Iterator[Option]:
+def options(part: Any) -> Iterator[Option]:
     """Yield every option of a dataclass and of the dataclasses inside it, but not the fields marked "fixed"."""
-    hints = get_type_hints(type(config), include_extras=True)
-    for field in fields(config):
-        value, hint = getattr(config, field.name), hints[field.name]
+    hints = get_type_hints(type(part), include_extras=True)
+    for field in fields(part):
+        value, hint = getattr(part, field.name), hints[field.name]
         if is_dataclass(value):
             yield from options(value)
         elif get_origin(hint) is Annotated and get_args(hint)[1] != "fixed":
@@ -91,21 +91,21 @@ def options(config: Any) -> Iterator[Option]:
             yield Option(field.name, kind, value, words, bounds, "scales" in more)
 
 
-def override(config: Any, values: Mapping[str, Any]) -> Any:
+def override(part: Any, values: Mapping[str, Any]) -> Any:
     """Return the dataclass with some of its options replaced. Names that it does not have are ignored."""
     changes: dict[str, Any] = {}
-    known = {option.name: option for option in options(config)}
-    for field in fields(config):
-        if is_dataclass(value := getattr(config, field.name)):
+    known = {option.name: option for option in options(part)}
+    for field in fields(part):
+        if is_dataclass(value := getattr(part, field.name)):
             changes[field.name] = override(value, values)
         elif field.name in values and field.name in known:
             changes[field.name] = known[field.name].check(values[field.name])
-    return replace(config, **changes)
+    return replace(part, **changes)
 
 
-def check_names(values: Iterable[str], *configs: Any) -> None:
+def check_names(values: Iterable[str], *parts: Any) -> None:
     """Raise DelayRLError, with the nearest names, for a name that is no option of the dataclasses."""
-    known = [option.name for config in configs for option in options(config)]
+    known = [option.name for part in parts for option in options(part)]
     for name in values:
         if name not in known:
             near = near_names(name, [*known, *sorted(TAKEN - {name})])
@@ -113,6 +113,6 @@ def check_names(values: Iterable[str], *configs: Any) -> None:
             raise DelayRLError(f"unknown hyperparameter {name!r}{hint}")
 
 
-def values_of(config: Any) -> dict[str, Any]:
+def values_of(part: Any) -> dict[str, Any]:
     """Return all options by name: what `override` needs to rebuild the dataclass."""
-    return {option.name: list(o) if isinstance(o := option.default, tuple) else o for option in options(config)}
+    return {option.name: list(o) if isinstance(o := option.default, tuple) else o for option in options(part)}

@@ -150,14 +150,14 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
         """Issue an action. Returns what has arrived by the next step."""
-        applied = self._transit.act(np.asarray(action, self._dtype))
+        acting = self._transit.act(np.asarray(action, self._dtype))
         reward: Any = 0.0
         terminated = truncated = False
         if self._transit.over:
             truncated = self._limit is not None and self._transit.time + 1 >= self._limit
             self._info = {}
         else:
-            shown = self.env.step(applied)
+            shown = self.env.step(acting)
             parts = _parts(self.env, "step", shown, 5, "observation, reward, terminated, truncated and info")
             self._truth, reward, terminated, truncated, self._info = parts
         reward, terminated, truncated = self._transit.step(self._truth, reward, terminated, truncated)

@@ -147,14 +147,14 @@ class Transit:
 
     def act(self, action: NDArray[Any]) -> NDArray[Any]:
         """Issue an action. Returns the one that acts now: the same array if it has no delay."""
-        applied, now, rows = action, self.time, self._rows
+        acting, now, rows = action, self.time, self._rows
         if self._max_action_delay:
             self._action_age = min(now - self._actions.send(now, self.random), self._max_action_delay)
             if self._action_age:  # the ring holds the idle action where none has been issued
-                applied = self._ring[(now - self._action_age) % rows].copy()
+                acting = self._ring[(now - self._action_age) % rows].copy()
         row = now % rows
         self._ring[row] = self._ring[row + rows] = action
-        return applied
+        return acting
 
     def step(self, truth: NDArray[Any], reward: float, terminated: bool, truncated: bool) -> tuple[float, bool, bool]:
         """Take in the outcome of a step, and return the reward, termination and truncation that arrive now.

@@ -140,7 +140,7 @@ class Controller:
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
         actions = None if idle is None else _action(policy, idle, "idle"), _first_action(policy)
-        sizes = self._clock.period, self.action_delay, policy.max_age + self.action_delay + EXTRA_STEPS
+        sizes = self._clock.dt, self.action_delay, policy.max_age + self.action_delay + EXTRA_STEPS
         self._history = partial(History, *sizes, *actions, self._telemetry.counts)
         self._episode = self._new_episode(0, 0.0 if stamps == "steps" else -np.inf)
         _try(policy)
@@ -316,8 +316,8 @@ def _check(policy: ControlPolicy) -> None:
 def _warn_of_period(policy: ControlPolicy, clock: Clock) -> None:
     """Warn if steps are far from as long as those that the policy learned with."""
     learned = getattr(policy, "dt", None)
-    if clock.stamps == "seconds" and learned and not 0.9 < clock.period / learned < 1.1:
-        line = f"the policy learned with steps of {learned:g} s; got dt = {clock.period:g} s"
+    if clock.stamps == "seconds" and learned and not 0.9 < clock.dt / learned < 1.1:
+        line = f"the policy learned with steps of {learned:g} s; got dt = {clock.dt:g} s"
         warnings.warn(f"{line}: ages are counted in these", DelayWarning, stacklevel=3)
 
 

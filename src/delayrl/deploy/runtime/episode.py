@@ -44,14 +44,14 @@ class Clock:
             allowed = f"{SHORTEST_STEP:g} .. {LONGEST_STEP:g}"
             raise DelayRLError(f"stamps in seconds need the seconds of a step, {allowed}: give dt=…; got {dt!r}")
         self.stamps, self._read = stamps, read
-        self.period = 1.0 if dt is None else float(dt)
+        self.dt = 1.0 if dt is None else float(dt)
 
     @property
     def seconds(self) -> float:
         """The seconds of a step. Raises DelayRLError if stamps are in steps."""
         if self.stamps == "steps":
             raise DelayRLError("steps have no length in seconds; stamps='seconds' have")
-        return self.period
+        return self.dt
 
     def start(self, now: float | None) -> float:
         """Return when an episode starts that is reset at `now`; None reads the clock. Steps start at 0."""
@@ -83,7 +83,7 @@ class History:
     """Keep the steps, when they begin, and their actions. Only this class rounds time to steps.
 
     Args:
-        period: nominal length of a step; 1 if time is counted in steps.
+        dt: nominal length of a step; 1 if time is counted in steps.
         lead: steps from a command to its effect.
         capacity: how many steps are remembered.
         idle: the action of a step without a command, [A]; None to go on with the action before.
@@ -92,9 +92,9 @@ class History:
     """
 
     def __init__(
-        self, period: float, lead: int, capacity: int, idle: Action | None, first: Action, counts: dict[str, int]
+        self, dt: float, lead: int, capacity: int, idle: Action | None, first: Action, counts: dict[str, int]
     ) -> None:
-        self._period, self.lead, self._capacity = period, lead, capacity
+        self._dt, self.lead, self._capacity = dt, lead, capacity
         self._idle, self._first, self._counts = idle, first, counts
         self._begins: deque[float] = deque(maxlen=capacity)
         self._actions: deque[Action] = deque(maxlen=capacity)
@@ -125,7 +125,7 @@ class History:
         while i > 0 and stamp < (begins[i - 1] + begins[i]) / 2:
             i -= 1
         if i == 0 and first > 0:  # no longer remembered: count back one period at a time
-            i = min(0, math.floor((stamp - begins[0]) / self._period + 0.5))
+            i = min(0, math.floor((stamp - begins[0]) / self._dt + 0.5))
         step = min(max(0, first + i), commanded - self.lead)
         return step, commanded - step, actions[max(0, step - first) :]
 
@@ -159,18 +159,18 @@ class History:
         """Return the steps from the newest step to that of a command at `now`; 0 if they are the same."""
         if not self._begins:
             return elapsed + self.lead + 1
-        return math.floor((now + self.lead * self._period - self._begins[-1]) / self._period + 0.5)
+        return math.floor((now + self.lead * self._dt - self._begins[-1]) / self._dt + 0.5)
 
     def _begins_up_to(self, now: float, gap: int) -> list[float]:
         """Return when the `gap` steps after the newest begin, up to that of a command at `now`; long gaps are cut."""
-        begin = now + self.lead * self._period
+        begin = now + self.lead * self._dt
         uncommanded = min(gap - 1, self._capacity)
         if uncommanded < 0:
             return []
         if self._begins:  # without a command the plant went on, a period at a time
             last = self._begins[-1]
-            return [last + (gap - uncommanded + i) * self._period for i in range(uncommanded)] + [begin]
-        return [begin - (uncommanded - i) * self._period for i in range(uncommanded)] + [begin]
+            return [last + (gap - uncommanded + i) * self._dt for i in range(uncommanded)] + [begin]
+        return [begin - (uncommanded - i) * self._dt for i in range(uncommanded)] + [begin]
 
     def _uncommanded(self) -> Action:
         """Return the action of a step that has no command."""
@@ -248,7 +248,7 @@ class Episode:
         if not self._kept:
             hint = "wait until `controller.ready`; `statistics` counts what was refused"
             raise DelayRLError(f"this episode has no observation: {hint}")
-        if (newest := self._kept[-1][0]) > now + self._clock.period / 2:
+        if (newest := self._kept[-1][0]) > now + self._clock.dt / 2:
             raise ClockError(f"now is {now:g}, more than half a step before the newest observation, made at {newest:g}")
         elapsed = self._elapsed(now)
 
@@ -286,12 +286,12 @@ class Episode:
             return "late"
         time = self._now(now)
         self._latest = max(self._latest, time)
-        if stamp > time + self._clock.period / 2:
+        if stamp > time + self._clock.dt / 2:
             return "future"
         place = bisect_left(self._kept, stamp, key=_stamp)
         if place < len(self._kept) and stamp == self._kept[place][0]:
             return "duplicate"
-        back = self._holds and time < self._latest - self._clock.period / 2  # stamps repeat what was held back
+        back = self._holds and time < self._latest - self._clock.dt / 2  # stamps repeat what was held back
         return "late" if stamp < self._oldest or back else "new"
 
     def _now(self, now: float | None) -> float:
@@ -299,7 +299,7 @@ class Episode:
 
     def _elapsed(self, now: float) -> int:
         """Return the steps from the start to `now`: none of them had a command if the first is given then."""
-        return max(0, math.floor((now - self._start) / self._clock.period + 0.5))
+        return max(0, math.floor((now - self._start) / self._clock.dt + 0.5))
 
 
 def _stamp(kept: tuple[float, NDArray[np.float64]]) -> float:
