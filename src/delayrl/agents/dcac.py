@@ -125,7 +125,8 @@ class DCAC:
 
         def loss(log_temperature: Array) -> tuple[Array, None]:
             known = metrics["target_steps"] > 0  # else the batch has no step, and no entropy
-            return known * temperature_loss(log_temperature, -metrics["entropy"], -float(windows.action.shape[-1])), None
+            target = -float(windows.action.shape[-1])
+            return known * temperature_loss(log_temperature, -metrics["entropy"], target), None
 
         adam = optax.adam(TEMPERATURE_RATE)
         log_temperature, opt_state, _, _ = descend(adam, loss, state.log_temperature, state.temperature_opt_state)
