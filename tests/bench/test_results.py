@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -199,7 +200,8 @@ def test_what_is_collected_stays(finished, tmp_path: Path) -> None:
     assert collect(grid, runs, less) == 8
     assert less.read_bytes() == whole
     (part / grid.cells[0].folder / "seed0" / "config.json").unlink()
-    with pytest.raises(delayrl.DelayRLError, match=r"seed0 has lost its config\.json: move .*[0-9a-f]{12} elsewhere"):
+    words = r"seed0 is not a run folder: it has no config\.json.*: move .*[0-9a-f]{12} elsewhere"
+    with pytest.raises(delayrl.DelayRLError, match=words):
         collect(grid, part, file)
 
 
@@ -291,6 +293,33 @@ def test_an_episode_twice(finished, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match="holds an episode twice"):
         collect(Grid("twice", "", Path("twice.toml"), (cell,)), runs, tmp_path / "t.sqlite")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("rows.jsonl", "", "ended, but rows of the last evaluation are missing"),
+        ("config.json", "hi\n", "config.json is damaged"),
+    ],
+)
+def test_a_damaged_cell_is_not_done(finished, name: str, text: str, words: str, tmp_path: Path, capsys) -> None:
+    """All commands say so, and what to do; the report shows the others."""
+    grid, runs = finished
+    file, home = tiny(tmp_path, text=MIXED, name="mixed"), tmp_path / "runs"
+    shutil.copytree(runs, home)
+    cell = grid.cells[0]
+    (home / cell.folder / "seed1" / name).write_text(text)
+    assert progress(cell, home).state == "failed"
+    line = rf"seed1.*{words}.*: move .*{cell.folder} elsewhere, and run the cell again"
+    for words_of in (["collect"], ["run", "--workers", "1", "--cells", cell.id]):
+        with pytest.raises(SystemExit) as ended:
+            main(["bench", words_of[0], str(file), "--runs", str(home), *words_of[1:]])
+        assert ended.value.code == 2
+        assert re.search(line, capsys.readouterr().err)
+    main(["bench", "report", str(file), "--runs", str(home)])
+    assert re.search(f"failed: .*{line}", capsys.readouterr().err)
+    main(["bench", "status", str(file), "--runs", str(home)])
+    assert re.search(f"failed: .*{line}", capsys.readouterr().out)
 
 
 def test_a_run_that_went_on_is_not_of_its_cell(finished, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import delayrl
 from delayrl.agents.registry import AGENTS
-from delayrl.cli.console import Parser, pair
+from delayrl.cli.console import Parser, name_and_value
 from delayrl.cli.main import COMMANDS, main
 from delayrl.cli.train import add_options
 from delayrl.run.configuration import options
@@ -142,13 +142,13 @@ def test_watch_ends_quietly(run: Path, tmp_path: Path) -> None:
     ],
 )
 def test_values_of_keyword_arguments(text: str, value: object) -> None:
-    assert pair(f"name={text}") == ("name", value)
-    assert type(pair(f"name={text}")[1]) is type(value)
+    assert name_and_value(f"name={text}") == ("name", value)
+    assert type(name_and_value(f"name={text}")[1]) is type(value)
 
 
 def test_a_keyword_argument_of_thousands_of_brackets() -> None:
     with pytest.raises(delayrl.DelayRLError, match=r"^the value of name is nested too deeply$"):
-        pair("name=" + "[" * 3000 + "]" * 3000)
+        name_and_value("name=" + "[" * 3000 + "]" * 3000)
 
 
 def test_a_run_folder_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:

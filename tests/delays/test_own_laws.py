@@ -75,7 +75,7 @@ def test_its_state_is_its_own() -> None:
 def test_what_an_episode_draws_of_an_own_law_is_checked() -> None:
     law = PerEpisode(Wrong())
     assert str(law) == "episode:<Wrong:1>"
-    with pytest.raises(DelayRLError, match="drew 9 steps, and its maximum is 1"):
+    with pytest.raises(DelayRLError, match="drew 9: a travel time is a whole number of steps from 0 to its maximum, 1"):
         law.draw(0, np.random.default_rng(0))
 
 
@@ -153,7 +153,10 @@ def test_what_is_no_law(delay: Any, words: str) -> None:
 
 @pytest.mark.parametrize(
     ("times", "words"),
-    [((3,), "drew 3 steps, and its maximum is 2"), ((-1,), "cannot be negative"), ((0.5,), "counts whole")],
+    [
+        ((time,), f"drew {time}: a travel time is a whole number of steps from 0 to its maximum, 2")
+        for time in (3, -1, 0.5)
+    ],
 )
 def test_travel_times_are_checked(times: tuple, words: str) -> None:
     for delay in (as_delay(Cycle(times)), as_delay(Delay(Cycle(times), action=2)).observed()):

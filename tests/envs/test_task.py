@@ -273,6 +273,8 @@ def test_wrappers_have_names_and_arguments_fit_in_json() -> None:
     assert delayrl.make(Arm, names=np.ones(2)).unwrapped.names.shape == (2,)  # not recorded, so it may be anything
     with pytest.raises(DelayRLError, match="a task is an id, module:function, a class or a function; got 3"):
         delayrl.make(3)  # type: ignore[arg-type]
+    with pytest.raises(DelayRLError, match="a wrapper is module:Class, a class or a function; got 3"):
+        delayrl.make(Arm, wrappers=[3])  # type: ignore[list-item]
 
 
 # ------------------------------------------------------------------------------------------------ stored runs

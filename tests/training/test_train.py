@@ -294,7 +294,9 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
         ({"seeds": []}, "a list of different seeds"),
         ({"seeds": [1, 1]}, "a list of different seeds"),
         ({"seeds": [0.5]}, "a seed must be a whole number from 0 to 2147483647; got 0.5"),
-        ({"seeds": 2.0}, "a list of different seeds without seed=; got 2.0"),
+        ({"seeds": 2.0}, "a list of different seeds; got 2.0"),
+        ({"seed": 1, "seeds": [0, 2]}, r"without seed=; got seed=1, seeds=\[0, 2\]"),
+        ({"flatten": "no"}, "flatten is True or False; got 'no'"),
         ({"seed": 1.5}, "a seed must be a whole number from 0 to 2147483647; got 1.5"),
         ({"seed": "0"}, "a seed must be a whole number from 0 to 2147483647; got '0'"),
         ({"seeds": [0, 1], "seed": 3}, "without seed="),
@@ -320,6 +322,13 @@ def test_full_disk(nth: int, tmp_path: Path, monkeypatch) -> None:
 def test_bad_values(values: dict, words: str, tmp_path: Path) -> None:
     with pytest.raises(delayrl.DelayRLError, match=words):
         train("vdpo", tmp_path / "run", **values)
+
+
+def test_a_folder_is_a_path() -> None:
+    with pytest.raises(delayrl.DelayRLError, match="out is the path of a folder; got 3"):
+        delayrl.train("bpql", "Pendulum-v1", 2, out=3)  # type: ignore[call-overload]
+    with pytest.raises(delayrl.DelayRLError, match="there is no folder None"):
+        delayrl.runs(None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

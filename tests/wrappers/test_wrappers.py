@@ -186,6 +186,14 @@ def test_an_episode_in_which_nothing_is_observed(monkeypatch) -> None:
     delayrl.make("Reacher-v5", "uniform:1:50")
 
 
+def test_an_action_of_another_shape_is_refused() -> None:
+    env = delayrl.make("Pendulum-v1", 3)
+    env.reset(seed=0)
+    for action in (0.0, [0.0, 1.0], [[0.0]]):
+        with pytest.raises(delayrl.DelayRLError, match=r"an action has the shape \(1,\); got one of "):
+            env.step(action)
+
+
 def test_what_is_no_environment_is_refused() -> None:
     with pytest.raises(
         delayrl.DelayRLError, match=r"takes an environment; got 'Pendulum-v1': gymnasium.make makes one"

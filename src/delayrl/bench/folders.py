@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from delayrl.errors import DelayRLError
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
 from delayrl.run.disk import disk_errors, lock, parsed, write_file
+from delayrl.run.folder import RunFolder
 
 if TYPE_CHECKING:
     from delayrl.bench.grid import Grid
@@ -90,17 +91,48 @@ def stored(folder: Path, seeds: tuple[int, ...]) -> tuple[int, bool]:
     return min(steps), all(complete)
 
 
+def damage(folder: Path, cell: "Cell") -> str:
+    """Return what has become of a complete cell's runs, and what to do about it, or "" if they look whole.
+
+    Of each run this reads the configuration and the last row alone: what may be missing before is not looked for.
+    """
+    for run in seed_paths(folder, cell.seeds):
+        try:
+            check_length(RunFolder(run), cell)
+        except DelayRLError as error:
+            return f"{error}: {again(folder)}"
+        if _last_line(run / "rows.jsonl").get("step") != cell.condition.steps:
+            return f"{run} ended, but rows of the last evaluation are missing: {again(folder)}"
+    return ""
+
+
+def check_length(run: RunFolder, cell: "Cell") -> None:
+    """Raise DelayRLError if a cell's run was trained further than the cell, or its configuration is damaged."""
+    if (trained := run.config["schedule"]["steps"]) != cell.condition.steps:
+        line = f"{run.path} was trained for {trained:,} steps, and its cell for {cell.condition.steps:,}"
+        raise DelayRLError(line)
+
+
+def again(folder: Path) -> str:
+    """Write how to get a cell with a damaged run: its seeds begin together."""
+    return f"move {folder} elsewhere, and run the cell again"
+
+
 def newest_metrics(run: Path) -> dict[str, Any]:
     """Return the numbers in the last complete line of a run's metrics, or an empty dict if there is none."""
+    found = _last_line(run / "metrics.jsonl")
+    return {name: value for name, value in found.items() if isinstance(value, int | float) and abs(value) < math.inf}
+
+
+def _last_line(file: Path) -> dict[str, Any]:
+    """Return the object in the last complete line of a file, empty if there is none."""
     try:
-        with open(run / "metrics.jsonl", "rb") as file:
-            file.seek(0, os.SEEK_END)
-            file.seek(max(0, file.tell() - 8192))
-            lines = file.read().split(b"\n")[:-1]
-        found = _loaded(lines[-1].decode(errors="replace"))
+        with open(file, "rb") as lines:
+            lines.seek(0, os.SEEK_END)
+            lines.seek(max(0, lines.tell() - 8192))
+            return _loaded(lines.read().split(b"\n")[:-1][-1].decode(errors="replace"))
     except (OSError, IndexError):
         return {}
-    return {name: value for name, value in found.items() if isinstance(value, int | float) and abs(value) < math.inf}
 
 
 def prepare(folder: Path, cell: "Cell") -> None:

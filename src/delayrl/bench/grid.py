@@ -4,6 +4,7 @@ A cell is one lockstep group of seeds. Its id hashes the resolved configuration,
 written does not change ids, and grids that contain the same cell share its results.
 """
 
+import contextlib
 import functools
 import json
 import re
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 
 from delayrl.envs.making import make
 from delayrl.envs.task import as_task, closing_quietly
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, did_you_mean, near_names
 from delayrl.play.evaluation import check_seed
 from delayrl.play.policy import spec_of
 from delayrl.run.agents import find_agent
@@ -130,27 +131,37 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
         line = f"{unused} is for the grid's own products, and it has none"
         raise DelayRLError(f"{line}; the cells it includes keep theirs")
     shared: dict[str, Any] = DEFAULTS | {key: value for key, value in table.items() if key in PRODUCT}
-    every: list[str] = []
+    wholes = []
     for number, item in enumerate(products, 1):
-        try:
+        with _in_product(number if "product" in table else 0):
             _check_keys(item, PRODUCT, "a product")
             own = item.get("overrides", {})
-            whole = shared | item | {"overrides": _merge(shared["overrides"], own)}
-            cells += _cells(whole)
-            _check_overrides(own, whole["agents"])
-            every += whole["agents"]
-        except DelayRLError as error:
-            raise DelayRLError(f"product {number}: {error}" if "product" in table else str(error)) from error
-    if not cells:
+            wholes.append(shared | item | {"overrides": _merge(shared["overrides"], own)})
+            _check_lists(wholes[-1])
+            _check_overrides(own, wholes[-1]["agents"])
+    if not cells and not wholes:
         raise DelayRLError("there are no products, so nothing to run")
-    _check_overrides(shared["overrides"], every)
+    _check_overrides(shared["overrides"], [agent for whole in wholes for agent in whole["agents"]])
+    for number, whole in enumerate(wholes, 1):
+        with _in_product(number if "product" in table else 0):
+            cells += _cells(whole)
     return cells
+
+
+@contextlib.contextmanager
+def _in_product(number: int) -> Iterator[None]:
+    """Name the product in errors, unless its number is 0."""
+    try:
+        yield
+    except DelayRLError as error:
+        raise DelayRLError(f"product {number}: {error}" if number else str(error)) from error
 
 
 def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], what: str) -> None:
     for key, value in table.items():
         if key not in known:
-            raise DelayRLError(f"unknown key {key!r} of {what}; allowed are {', '.join(known)}")
+            hint = did_you_mean(near_names(key, known), f"allowed are {', '.join(known)}")
+            raise DelayRLError(f"unknown key {key!r} of {what}{hint}")
         if not isinstance(value, known[key]) or (isinstance(value, bool) and known[key] is not bool):
             words = {list: "a list", dict: "a table", str: "a string", int: "a whole number", bool: "true or false"}
             raise DelayRLError(f"{key} must be {words.get(known[key], 'a number or a list')}; got {value!r}")
@@ -186,17 +197,26 @@ def _applicable(overrides: Mapping[str, Any], agent: str) -> dict[str, Any]:
     return {name: value for name, value in overrides.items() if name in known}
 
 
-def _cells(table: dict[str, Any]) -> Iterator[Planned]:
-    """Yield the cells of one product."""
+def _check_lists(table: Mapping[str, Any]) -> None:
+    """Raise DelayRLError if a product has no agents, tasks or delays, one of another type, or an unknown agent."""
     for key, kind in (("agents", str), ("tasks", str), ("delays", int | float | str)):
         if not table.get(key):
             raise DelayRLError(f"there are no {key}, so nothing to run")
         for item in table[key]:
             if not isinstance(item, kind) or isinstance(item, bool):
                 raise DelayRLError(f"{key} cannot hold {item!r}")
-    tables = {name: value for name, value in table["overrides"].items() if isinstance(value, dict)}
-    for agent in [*table["agents"], *tables]:
+    for agent in [*table["agents"], *_tables(table)]:
         find_agent(agent)
+
+
+def _tables(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a product's overrides for single agents."""
+    return {name: value for name, value in table["overrides"].items() if isinstance(value, dict)}
+
+
+def _cells(table: Mapping[str, Any]) -> Iterator[Planned]:
+    """Yield the cells of one product."""
+    tables = _tables(table)
     shared = {name: value for name, value in table["overrides"].items() if name not in tables}
     groups = _seed_groups(table["seeds"], table.get("lockstep"))
     around = table.get("env_kwargs"), table.get("wrappers", ()), table.get("flatten", False)

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid
-from delayrl.bench.status import progress
+from delayrl.bench.status import is_lost, progress
 from delayrl.errors import DelayRLError, count
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.cost import Cost
@@ -49,13 +49,13 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 
 def _own_rows(cell: Cell, path: Path) -> list[Row]:
     """Return the rows of a cell's run. Raises DelayRLError if it was trained further than the cell, or is damaged."""
-    run, steps = RunFolder(path), cell.condition.steps
-    rows = name_configuration(run.read("rows"))
-    if rows and not run.exists:
-        raise DelayRLError(f"{path} has lost its config.json: {_again(path.parent)}")
-    if rows and (trained := run.config["schedule"]["steps"]) != steps:
-        line = f"{path} was trained for {trained:,} steps, and its cell for {steps:,}"
-        raise DelayRLError(f"{line}: {_again(path.parent)}")
+    run = RunFolder(path)
+    try:
+        rows = name_configuration(run.read("rows"))
+        if rows:
+            folders.check_length(run, cell)
+    except DelayRLError as error:
+        raise DelayRLError(f"{error}: {folders.again(path.parent)}") from error
     return rows
 
 
@@ -149,24 +149,13 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
         if elsewhere and (best[:2] > here[:2] or (best > here and not begun)):
             total += _copy_cell(table, elsewhere, cell, number)
             continue
-        if p.state == "done" and (cut := [str(path) for path, _, rows in found if _last(rows) < cell.condition.steps]):
-            line = f"{', '.join(cut)} ended, but rows of the last evaluation are missing"
-            raise DelayRLError(f"{line}: {_again(runs / cell.folder)}")
+        if is_lost(cell, runs, p):
+            raise DelayRLError(p.line)
         _insert_cell(table, cell, number, p)
         total += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)
     table.commit()
     table.execute("VACUUM")
     return total
-
-
-def _again(folder: Path) -> str:
-    """Write how to get a cell with a damaged run: its seeds begin together."""
-    return f"move {folder} elsewhere, and run the cell again"
-
-
-def _last(rows: Sequence[Row]) -> int:
-    """Return the step of the last evaluation; what may be missing before it is not looked for."""
-    return max((row["step"] for row in rows), default=0)
 
 
 def cells_done(file: Path) -> int:
@@ -228,8 +217,15 @@ class Collected(NamedTuple):
 
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the configurations of the runs that have begun."""
-    paths = [path for cell in cells for path in folders.seed_paths(runs / cell.folder, cell.seeds)]
-    return [RunFolder(path).config for path in paths if (path / "config.json").exists()]
+    configs = []
+    for cell in cells:
+        for path in folders.seed_paths(runs / cell.folder, cell.seeds):
+            if (run := RunFolder(path)).exists:
+                try:
+                    configs.append(run.config)
+                except DelayRLError as error:
+                    raise DelayRLError(f"{error}: {folders.again(path.parent)}") from error
+    return configs
 
 
 def read_table(file: str | Path) -> Collected:

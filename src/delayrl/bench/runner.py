@@ -114,10 +114,15 @@ class _Queue:
         self._in_vain, self._step = Counter[str](), dict[str, int]()
 
     def add(self, cell: Cell) -> None:
-        """Queue a cell, unless it is complete."""
-        folders.prepare(self._runs / cell.folder, cell)
-        complete = folders.stored(self._runs / cell.folder, cell.seeds)[1]
-        (self.completion.done if complete else self.waiting).append(cell)
+        """Queue a cell, unless it is complete; if it is, and damaged, it has failed."""
+        folder = self._runs / cell.folder
+        folders.prepare(folder, cell)
+        if not folders.stored(folder, cell.seeds)[1]:
+            self.waiting.append(cell)
+        elif line := folders.damage(folder, cell):
+            self.completion.failed[cell.id] = line
+        else:
+            self.completion.done.append(cell)
 
     def start(self, now: float) -> None:
         """Start waiting cells while the backend has room."""

@@ -22,10 +22,16 @@ def progress(cell: Cell, runs: Path) -> Progress:
     if holder is not None:
         return Progress("running", max(step, int(metrics.get("step", 0))), speed, holder)
     if complete:
-        return Progress("done", step, speed)
+        lost = folders.damage(folder, cell)
+        return Progress("failed" if lost else "done", step, speed, lost)
     if events and events[-1]["event"] == "failed":
         return Progress("failed", step, speed, str(events[-1].get("line", "")))
     return Progress("begun" if step else "todo", step, speed)
+
+
+def is_lost(cell: Cell, runs: Path, progress: Progress) -> bool:
+    """Tell whether a cell is complete and damaged. One that failed otherwise goes on from what it stored."""
+    return progress.state == "failed" and folders.stored(runs / cell.folder, cell.seeds)[1]
 
 
 def standing(cells: Sequence[Cell], runs: Path) -> list[tuple[Cell, Progress]]:
@@ -89,8 +95,12 @@ def table(standing: Standing) -> list[list[str]]:
 
 def closing_lines(name: str, standing: Standing, workers: int) -> list[str]:
     """Return the lines below the table: the standing of the grid, and its failures."""
-    failures = [f"failed: {cell} ({cell.id}): {p.line}" for cell, p in standing if p.state == "failed"]
-    return [f"{name}: {line(standing, workers)}", *failures]
+    return [f"{name}: {line(standing, workers)}", *failures(standing)]
+
+
+def failures(standing: Standing) -> list[str]:
+    """Return a line for each cell that failed."""
+    return [f"failed: {cell} ({cell.id}): {p.line}" for cell, p in standing if p.state == "failed"]
 
 
 def duration(seconds: float) -> str:

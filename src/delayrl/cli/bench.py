@@ -9,9 +9,9 @@ from typing import Any
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
-from delayrl.bench.status import HEAD, closing_lines, duration, line, progress, standing, table
+from delayrl.bench.status import HEAD, closing_lines, duration, failures, is_lost, line, progress, standing, table
 from delayrl.cli.console import StatusLine, positive, print_table
-from delayrl.errors import STOPPED, DelayRLError
+from delayrl.errors import STOPPED, DelayRLError, count
 from delayrl.run.cell import Cell
 from delayrl.training.signals import stop_signal
 
@@ -92,7 +92,7 @@ def _plan(grid: Grid, given: argparse.Namespace) -> None:
         print(f"\nall cells: {', '.join(sorted(everywhere))}")
     runs = sum(len(cell.seeds) for cell in grid.cells)
     steps = sum(cell.condition.steps * len(cell.seeds) for cell in grid.cells)
-    print(f"\n{grid.name}: {len(grid.cells)} cells, {runs} runs, {steps:,} steps")
+    print(f"\n{grid.name}: {count(len(grid.cells), 'cell')}, {count(runs, 'run')}, {count(steps, 'step')}")
     if grid.description:
         print(grid.description)
 
@@ -107,8 +107,8 @@ def _collect(grid: Grid, given: argparse.Namespace) -> None:
     from delayrl.bench.results import cells_done, collect
 
     out = given.out or given.runs / f"{grid.name}.sqlite"
-    count = collect(grid, given.runs, out, given.also)
-    print(f"{out}: {count:,} rows; {cells_done(out)} of {len(grid.cells)} cells are done")
+    rows = collect(grid, given.runs, out, given.also)
+    print(f"{out}: {rows:,} rows; {cells_done(out)} of {len(grid.cells)} cells are done")
 
 
 def _report(grid: Grid | None, given: argparse.Namespace) -> None:
@@ -123,10 +123,13 @@ def _report(grid: Grid | None, given: argparse.Namespace) -> None:
     else:
         folder, name, description = given.runs, grid.name, grid.description
         cells = standing(grid.cells, given.runs)
-        rows, configs = rows_of(grid.cells, given.runs), configs_of(grid.cells, given.runs)
+        whole = [cell for cell, progress in cells if not is_lost(cell, given.runs, progress)]
+        rows, configs = rows_of(whole, given.runs), configs_of(whole, given.runs)
     page = report(rows, cells, given.out or folder / f"{name}-report", name, configs, description)
     done = sum(progress.state == "done" for _, progress in cells)
     print(f"{name}: {done} of {len(cells)} cells are done\nopen {page}; the same as Markdown is beside it")
+    for failure in failures(cells):
+        print(failure, file=sys.stderr)
 
 
 def _run(grid: Grid, given: argparse.Namespace) -> None:
@@ -150,8 +153,8 @@ def _run(grid: Grid, given: argparse.Namespace) -> None:
     print(f"{grid.name}: {len(completion.done)} of {len(cells)} cells done")
     if completion.failed:
         first = next(iter(completion.failed.values()))
-        count = f"{len(completion.failed)} of {len(cells)} cells failed"
-        failure = f"{count}, the first: {first} (`delayrl bench status` lists all)"
+        number = f"{len(completion.failed)} of {len(cells)} cells failed"
+        failure = f"{number}, the first: {first} (`delayrl bench status` lists all)"
         if not completion.unfinished:
             raise DelayRLError(failure)
         print(failure, file=sys.stderr)

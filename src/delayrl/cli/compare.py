@@ -36,14 +36,15 @@ def run(given: argparse.Namespace) -> None:
         raise DelayRLError(f"--out must end in .png, .pdf or .svg; got {given.out}")
     groups = [_seeds(path) for path in given.runs]
     configs = [group[0].config | {"delay": group[0].delay} for group in groups]
+    learned = [_curve(group) for group in groups]  # what cannot be read is refused before anything is printed
     labels = LABELS[: len(groups)]
     for label, path, group in zip(labels, given.runs, groups, strict=True):
         print(f"{label}  {path}" + (f" ({len(group)} seeds)" if len(group) > 1 else ""))
     print()
     print_table(["option", *labels], differences(configs) or [["all options", *["the same"] * len(labels)]])
     lines = [
-        (f"{label}: {config['agent']}, delay {config['delay']}", *_curve(group))
-        for label, config, group in zip(labels, configs, groups, strict=True)
+        (f"{label}: {config['agent']}, delay {config['delay']}", *curve)
+        for label, config, curve in zip(labels, configs, learned, strict=True)
     ]
     print()
     _print_returns(labels, lines)
@@ -70,7 +71,8 @@ def _curve(group: Sequence["Run"]) -> tuple[NDArray[Any], NDArray[Any]]:
     means = [{int(step): float(x.mean()) for step, x in zip(*one.curve(), strict=True)} for one in group]
     steps, returns = common_steps(means)
     if not len(steps):
-        raise DelayRLError(f"{group[0].path.parent if len(group) > 1 else group[0].path} has no evaluation yet")
+        path = group[0].path.parent if len(group) > 1 else group[0].path
+        raise DelayRLError(f"{path} has no whole evaluation: it has just begun, or its rows are lost")
     return steps, returns
 
 

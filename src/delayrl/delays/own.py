@@ -51,8 +51,10 @@ class OwnLaw:
         except (TypeError, ValueError) as error:
             line = f"{self.text} drew {drawn!r:.80}, not a travel time and the next state: {PAGE}"
             raise DelayRLError(line) from error
-        if whole_steps(travel) > self.maximum:
-            raise DelayRLError(f"{self.text} drew {travel} steps, and its maximum is {self.maximum}")
+        whole = isinstance(travel, int | np.integer) and not isinstance(travel, bool)
+        if not whole or not 0 <= travel <= self.maximum:
+            allowed = f"a travel time is a whole number of steps from 0 to its maximum, {self.maximum}"
+            raise DelayRLError(f"{self.text} drew {travel!r}: {allowed}")
         return int(travel), state
 
     def __str__(self) -> str:

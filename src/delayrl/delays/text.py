@@ -32,7 +32,7 @@ from delayrl.delays.episodes import PerEpisode, unsynchronised
 from delayrl.delays.laws import Constant, DelayLaw, whole_steps
 from delayrl.delays.own import find_law
 from delayrl.delays.recordings import NUMBER, in_steps, recorded, rounded_up
-from delayrl.errors import DelayRLError
+from delayrl.errors import DelayRLError, did_you_mean, near_names
 
 StepSeconds = float | Callable[[], float | None] | None
 """The length of an environment step, or a function that returns it; None if it is unknown."""
@@ -163,7 +163,8 @@ class DelayParser:
             case "recorded" if self._folder is None:  # a run folder holds the numbers, and may come from elsewhere
                 path, _, unit = rest.rpartition(":")
                 return recorded(path, self.step_seconds, unit) if path and unit in ("s", "ms") else recorded(rest)
-        raise DelayRLError(f"unknown delay {part!r} ({FORMS})")
+        near = near_names(name, [*LAWS, *PRESETS]) if name not in LAWS else []
+        raise DelayRLError(f"unknown delay {part!r}{did_you_mean(near, FORMS)}")
 
     def values(self, rest: str, *readers: Callable[[str], Any]) -> list[Any]:
         """Split what follows the name of a law at its colons, and read each value with its reader."""

@@ -130,8 +130,12 @@ def as_task(
     first = replace(task.env, name=with_version(task.env.name), kwargs={**task.env.kwargs, **_plain(kwargs or {})})
     around = list(task.wrappers)
     for wrapper in [wrappers] if isinstance(wrappers, str) or callable(wrappers) else wrappers:
+        if not isinstance(wrapper, str) and not callable(wrapper):
+            raise DelayRLError(f"a wrapper is module:Class, a class or a function; got {wrapper!r}")
         more = _parse(wrapper) if isinstance(wrapper, str) else Task(_named(wrapper))
         around += [more.env, *more.wrappers]
+    if not isinstance(flatten, bool):
+        raise DelayRLError(f"flatten is True or False; got {flatten!r}")
     if flatten and around[-1:] != [Part(FLATTEN)]:
         around.append(Part(FLATTEN))
     for part in around:

@@ -38,7 +38,9 @@ def against_delay(results: Sequence["AgeEvaluation"], path: Path) -> None:
     with _axes(path) as axes:
         _band(axes, [int(r["delay"]) for r in results], [r["returns"] for r in results], COLOUR, first["agent"])
         title = plain_text(f"{first['env']}, one policy, {first['episodes']} episodes a point")
-        axes.set(xlabel="delay of the observations (steps)", ylabel="return", title=title)
+        words = "return, mean and range of the episodes"
+        axes.set(xlabel="delay of the observations (steps)", ylabel=words, title=title)
+        axes.xaxis.get_major_locator().set_params(integer=True)
 
 
 def curves(groups: Sequence[Line], path: Path, title: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -110,6 +111,6 @@ class Run:
 
 def runs(folder: str | Path = "runs") -> list[Run]:
     """Return all runs in a folder and below it, by their paths. Raises DelayRLError if there is no such folder."""
-    if not Path(folder).is_dir():
+    if not isinstance(folder, str | PathLike) or not Path(folder).is_dir():
         raise DelayRLError(f"there is no folder {folder}")
     return [Run(file.parent) for file in sorted(Path(folder).rglob("config.json")) if is_config(file)]

@@ -38,8 +38,10 @@ class Checkpoint:
         pieces = self.pieces if replay else {}
         for name, checksum in (self.files | pieces).items():
             file = (folder if name in pieces else self.path) / name
-            if Path(name).name != name or "\0" in name or _checksum(file) != checksum:
+            if Path(name).name != name or "\0" in name or (file.exists() and _checksum(file) != checksum):
                 raise DelayRLError(f"{name} is cut or changed")
+            if not file.exists():
+                raise DelayRLError(f"{name} is missing")
 
 
 def checkpoint_folders(run: Path) -> list[Path]:

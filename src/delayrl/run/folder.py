@@ -151,7 +151,9 @@ class RunFolder:
             if isinstance(found, Checkpoint):
                 return found
             broken.append(found)
-        raise DelayRLError(broken[0] if broken else f"{self.path} has no checkpoint yet")
+        if broken:
+            raise DelayRLError(f"{broken[0]}; --overwrite starts afresh")
+        raise DelayRLError(f"{self.path} has no checkpoint yet")
 
     def _checked(self, *, replay: bool) -> Iterator[Checkpoint | str]:
         """Yield the checkpoints, newest first, a line for a broken one; with the replay of unfinished ones or not."""

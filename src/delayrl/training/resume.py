@@ -77,7 +77,8 @@ def _planned(group: Group, overwrite: bool) -> Plan:
     replaced = [run for run in group.folders if overwrite and run.path in there]
     for run, seed in zip(group.folders, group.seeds, strict=True):
         if run.path not in there and not run.is_free:
-            raise DelayRLError(f"{run.path} is not empty and not a run folder; give another --out")
+            what = "not empty and not a run folder" if run.path.is_dir() else "a file"
+            raise DelayRLError(f"{run.path} is {what}; give another --out")
         if run.path not in there or run in replaced or group.further:
             continue
         try:

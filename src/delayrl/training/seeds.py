@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,11 @@ def seed_numbers(seed: int, seeds: int | Sequence[int] | None) -> list[int]:
             raise DelayRLError(f"seeds must be from 1 to {MOST:,}; got {seeds}")
         numbers: list[Any] = list(range(seed, seed + seeds))
     else:
-        numbers = list(seeds) if isinstance(seeds, Sequence) else []
-        if seed or not numbers or len(set(numbers)) < len(numbers):
-            raise DelayRLError(f"seeds is a number, or a list of different seeds without seed=; got {seeds!r}")
+        numbers = list(seeds) if isinstance(seeds, Sequence | np.ndarray) and not isinstance(seeds, str) else []
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise DelayRLError(f"seeds is a number, or a list of different seeds; got {seeds!r}")
+        if seed:
+            raise DelayRLError(f"a list of seeds is given without seed=; got seed={seed}, seeds={seeds!r}")
     for number in numbers:
         check_seed(number)
     return [int(number) for number in numbers]
@@ -39,6 +42,8 @@ def run_folders(condition: Condition, seeds: list[int], out: str | Path | None) 
 
     Raises DelayRLError if several were to lie within a run.
     """
+    if not isinstance(out, str | PathLike | None):
+        raise DelayRLError(f"out is the path of a folder; got {out!r}")
     kind = f"{condition.agent.strip('<>')}-{condition.preset}"
     if condition.protocol != "corrected":
         kind += f"-{condition.protocol}"

@@ -150,7 +150,10 @@ class Delayed(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, Info]:
         """Issue an action. Returns what has arrived by the next step."""
-        acting = self._transit.act(np.asarray(action, self._dtype))
+        action = np.asarray(action, self._dtype)
+        if action.shape != self.idle.shape:
+            raise DelayRLError(f"an action has the shape {self.idle.shape}; got one of {action.shape}")
+        acting = self._transit.act(action)
         reward: Any = 0.0
         terminated = truncated = False
         if self._transit.over:
