@@ -12,7 +12,7 @@ from scipy import stats
 from which import results_of
 
 from delayrl.bench.results import read_table
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, delay_order
 from delayrl.report.statistics import Floats
 

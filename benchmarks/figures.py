@@ -23,6 +23,7 @@ import which
 matplotlib.use("Agg")
 from learning import curves as learning
 from learning import times
+from pages import HERE, insert
 from PIL import Image
 from speed import tables as speed
 
@@ -31,14 +32,13 @@ from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
 from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
 from delayrl.report.wording import gradient_steps
 from delayrl.run.condition import resolve
 from delayrl.run.cost import Cost
 from delayrl.training.cost import cost_of
 
-HERE = Path(__file__).parent
 COLOURS = {
     "vdpo": "#1f6feb",
     "vdpo reference": "#8c8c8c",
@@ -251,14 +251,6 @@ def younger_table(lines: list[dict[str, Any]]) -> str:
         "`benchmarks/results/younger.jsonl`."
     )
     return f"{markdown_table(['travel time, steps', 'held back', 'shown at once (`min_age=0`)'], body)}\n\n{about}"
-
-
-def insert(page: Path, key: str, text: str) -> None:
-    """Replace the text between `<!-- key -->` and `<!-- /key -->` in a page."""
-    content = page.read_text()
-    begin, end = f"<!-- {key} -->", f"<!-- /{key} -->"
-    head, rest = content.split(begin)
-    page.write_text(head + begin + "\n" + text + "\n" + end + rest.split(end)[1])
 
 
 def measured(out: Path) -> None:

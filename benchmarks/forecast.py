@@ -23,7 +23,7 @@ from delayrl.core.forecast import forecast, forecasting
 from delayrl.core.networks import Params
 from delayrl.core.views import network_input, seen_now
 from delayrl.play.policy import Policy
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.run.provenance import versions
 
 OUT = Path(__file__).parent / "results" / "forecast.jsonl"

@@ -11,7 +11,7 @@ from matplotlib import pyplot
 from which import BUDGET, ended, results_of
 
 from delayrl.bench.results import read_table
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.wording import interval, normalised
 from delayrl.run.condition import Condition

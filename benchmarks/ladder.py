@@ -22,7 +22,7 @@ from scipy import stats
 from delayrl.bench.results import Collected, read_table
 from delayrl.errors import DelayRLError
 from delayrl.report import statistics
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
 from delayrl.run.cell import Cell

@@ -15,7 +15,7 @@ from matplotlib import pyplot
 
 from delayrl.bench.results import Collected, read_table
 from delayrl.errors import DelayRLError
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.run.condition import Condition
 
 ENV = "HalfCheetah-v5"

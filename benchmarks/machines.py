@@ -15,9 +15,9 @@ from typing import Any
 
 import blocks
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "machines.jsonl"
 NAMES = ("agent", "delay", "preset")

@@ -1,6 +1,6 @@
 """Test how well `delayrl measure LOG` recovers known delays: `python benchmarks/measure_accuracy.py`, some minutes.
 
-Writes one row for each log to results/measure.jsonl, and from these rows the tables of docs/measure.md. `--tables` only
+Writes one row for each log to results/measure.jsonl, and from these rows the tables of docs/measure.md. `--table` only
 writes the tables. A log is a CSV file, read like a user's. The delay is a whole number of rows, 0 to 11.
 """
 
@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pages import HERE, insert
 
 from delayrl.envs.making import make as make_task
 from delayrl.errors import DelayRLError
 from delayrl.measure import from_log
 from delayrl.measure.reading import Table, read_signals
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
-HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "measure.jsonl"
-PAGE = HERE.parent / "docs" / "measure.md"
 ROW, ROWS, LONGEST, SEEDS = 0.02, 2000, 40, 3
 PLANTS = ("gain", "integrator", "servo", "second order")
 COMMANDS = ("white", "smooth", "held", "policy")
@@ -200,14 +199,12 @@ def tables() -> None:
         f"{sum(np.logical_and(wide, np.logical_not(wrong)))}. "
         "Results: `benchmarks/results/measure.jsonl`."
     )
-    page = PAGE.read_text()
-    head, rest = page.split("<!-- accuracy -->")
-    PAGE.write_text(head + "<!-- accuracy -->\n" + text + "\n<!-- /accuracy -->" + rest.split("<!-- /accuracy -->")[1])
+    insert(HERE.parent / "docs" / "measure.md", "accuracy", text)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tables", action="store_true", help="only rewrite the tables")
-    if not parser.parse_args().tables:
+    parser.add_argument("--table", action="store_true", help="only rewrite the tables")
+    if not parser.parse_args().table:
         run()
     tables()

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "ppo.jsonl"
 VIEWS = ("blind", "augmented", "privileged")

@@ -11,9 +11,9 @@ import time
 from typing import Any
 
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "simulators.jsonl"
 DELAYS = ("5", "50", "uniform:1:5", "uniform:1:50", "episode:1:5+action=episode:0:5")

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import blocks
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "start.jsonl"
 NAMES = ("agent", "delay", "preset")

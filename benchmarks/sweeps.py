@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib import pyplot
 from numpy.typing import NDArray
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 Sweeps = dict[str, NDArray[np.float64]]
 """Mean returns by agent, [seeds, delays]; the delays are 0, 1, …"""
