@@ -98,7 +98,7 @@ def measure(works: list[tuple[str, int, str]], rounds: int, seconds: int) -> Non
                     own = dict(zip(NAMES, work, strict=True))
                     rows.append(own | {"processes": processes, "seeds": seeds, "round": number, "speed": found})
                     print(rows[-1], flush=True)
-    about = {"versions": versions(), "cpus": os.cpu_count(), "seconds": seconds}
+    about = {"versions": versions(), "seconds": seconds}
     blocks.replace(ROWS, about, rows, NAMES)
 
 
@@ -117,8 +117,9 @@ def table() -> str:
             cells = [f"**{m:,.0f}**" if m == max(medians) else f"{m:,.0f}" for m in medians]
             lines.append([f"`{agent}`", delay, *cells])
         rounds = 1 + max(row["round"] for row in rows)
-        words = f"{rounds} rounds of {about['seconds']} s, {about['cpus']} x86 cores, jax {about['versions']['jax']}"
-        notes.append(f"{', '.join(f'`{agent}`' for agent in agents)}: {words}, commit {about['versions']['commit']}.")
+        used = about["versions"]
+        words = f"{rounds} rounds of {about['seconds']} s, {used['cores']} x86 cores, jax {used['jax']}"
+        notes.append(f"{', '.join(f'`{agent}`' for agent in agents)}: {words}, commit {used['commit']}.")
     words = (
         "Seed-steps a second, processes × seeds of each; medians of rounds of learning, HalfCheetah-v5, preset `small`."
     )

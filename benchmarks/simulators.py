@@ -6,7 +6,6 @@ and the table in docs/performance.md; `--table` only the table.
 
 import argparse
 import json
-import os
 import time
 from typing import Any
 
@@ -54,7 +53,7 @@ def measure(rounds: int, device: str) -> None:
                 took = {"wall": time.perf_counter() - began, "processor": time.process_time() - processor}
                 rows.append({"robots": robots, "delay": name, "round": number, **took})
         print(f"{robots} robots: done", flush=True)
-    about = {"versions": versions(), "cpus": os.cpu_count(), "device": jax.devices()[0].device_kind, "steps": STEPS}
+    about = {"versions": versions(), "steps": STEPS}
     old = (
         [line for line in ROWS.read_text().splitlines() if json.loads(line)["name"] != device] if ROWS.exists() else []
     )
@@ -68,7 +67,8 @@ def table() -> str:
     for line in ROWS.read_text().splitlines():
         made = json.loads(line)
         about, rows = made["about"], made["rows"]
-        clock = "processor" if about["device"] == "cpu" else "wall"
+        used = about["versions"]
+        clock = "processor" if used["device"] == "cpu" else "wall"
         body = []
         for robots in ROBOTS:
             times = {
@@ -79,8 +79,7 @@ def table() -> str:
             ratios = [f"{np.median(times[delay] / times['']):.2f}" for delay in DELAYS]
             body.append([f"{robots:,}", f"{plain:.1f}", *ratios])
         rounds = 1 + max(row["round"] for row in rows)
-        kind = f"{about['cpus']} x86 cores, processor time" if clock == "processor" else f"{about['device']}, wall time"
-        used = about["versions"]
+        kind = f"{used['cores']} x86 cores, processor time" if clock == "processor" else f"{used['device']}, wall time"
         table = markdown_table(["robots", "without, ms a step", *(f"`{delay}`" for delay in DELAYS)], body)
         parts.append(f"{table}\n\nMedian of {rounds} rounds in turn; {kind}; jax {used['jax']}.")
     return "\n\n".join(parts) + " Rows: `benchmarks/results/simulators.jsonl`."

@@ -95,7 +95,7 @@ def measure(works: list[tuple[str, int, str]], rounds: int) -> None:
                     print(rows[-1], flush=True)
             size = sum(file.stat().st_size for file in Path(home, "delayrl").rglob("*") if file.is_file())
             rows[-1]["bytes"] = size
-    blocks.replace(ROWS, {"versions": versions(), "cpus": os.cpu_count()}, rows, NAMES)
+    blocks.replace(ROWS, {"versions": versions()}, rows, NAMES)
 
 
 def table() -> str:
@@ -110,7 +110,7 @@ def table() -> str:
             lines.append([f"`{work[0]}`", work[1], f"`{work[2]}`", *(f"{m:.1f}" for m in medians), f"{size / 1e6:.1f}"])
         agents = ", ".join(dict.fromkeys(f"`{agent}`" for agent, *_ in works))
         used = about["versions"]
-        words = f"{1 + max(row['round'] for row in rows)} rounds, {about['cpus']} x86 cores, Python {used['python']}"
+        words = f"{1 + max(row['round'] for row in rows)} rounds, {used['cores']} x86 cores, Python {used['python']}"
         notes.append(f"{agents}: {words}, jax {used['jax']}, commit {used['commit']}.")
     table = markdown_table(["agent", "Δ", "preset", "compiling, s", "compiled before, s", "kept, MB"], lines)
     return f"{table}\n\nMedians, HalfCheetah-v5. {' '.join(notes)} Rows: `benchmarks/results/start.jsonl`."
