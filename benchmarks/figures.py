@@ -1,7 +1,6 @@
 """Write the pictures and tables of the docs from committed files alone: `python benchmarks/figures.py`."""
 
 import functools
-import json
 import runpy
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 import against
 import forecast
 import front
+import jsonl
 import ladder
 import lost
 import matplotlib
@@ -54,7 +54,7 @@ DETAILS = ("speed-floors", "speed-operations")
 
 def read(name: str) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
     """Return configurations by run, rows, and evaluations of a results file."""
-    lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
+    lines = jsonl.read(HERE / "results" / f"{name}.jsonl")
     configs = {line["run"]: line["config"] for line in lines if "config" in line}
     return configs, [line for line in lines if "step" in line], [line for line in lines if "evaluation" in line]
 
@@ -134,7 +134,7 @@ def entropies(name: str) -> str:
 
 def overhead() -> str:
     """Return a Markdown table of what the wrappers cost."""
-    first, *lines = [json.loads(line) for line in (HERE / "results" / "overhead.jsonl").read_text().splitlines()]
+    first, *lines = jsonl.read(HERE / "results" / "overhead.jsonl")
     body = []
     for line in lines:
         low, high = line["quartiles"]
@@ -281,10 +281,7 @@ def main() -> None:
         insert(root / "docs" / "benchmarks.md", name, table(name) + "\n\n" + provenance(name))
     insert(root / "docs" / "protocols.md", "entropies", entropies("pusher-entropy"))
     insert(root / "docs" / "delays.md", "overhead", overhead())
-    udp, overruns, younger = (
-        [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
-        for name in ("udp", "overruns", "younger")
-    )
+    udp, overruns, younger = (jsonl.read(HERE / "results" / f"{name}.jsonl") for name in ("udp", "overruns", "younger"))
     insert(root / "docs" / "runtime.md", "younger", younger_table(younger))
     insert(root / "docs" / "runtime.md", "overruns", overruns_table(overruns))
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))

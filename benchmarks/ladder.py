@@ -6,12 +6,12 @@ begin with the same random actions, and with the same actor if they have one enc
 
 import functools
 import itertools
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jsonl
 import numpy as np
 from learning.curves import curve, difference, spread
 from matplotlib import pyplot
@@ -163,7 +163,7 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
 
 def update_times(file: Path) -> dict[str, float]:
     """Return the median ratio of each arm's update to BPQL's over the rounds of arms.py; nothing without its rows."""
-    rows = [json.loads(line) for line in file.read_text().splitlines()[1:]] if file.exists() else []
+    rows = jsonl.read(file)[1:] if file.exists() else []
     known = {row["arm"]: np.array(row["ms"]) for row in rows}
     return {arm: float(np.median(ms / known[BASE])) for arm, ms in known.items()}
 

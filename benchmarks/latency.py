@@ -7,7 +7,6 @@ process on one thread of one core. The spread over the tries is due to other wor
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -15,6 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import jsonl
 import numpy as np
 from pages import HERE, insert
 
@@ -86,12 +86,12 @@ def measure(tries: int, decisions: int) -> None:
                 if compiler:
                     lines.append(common | {"backend": "cpp", **in_cpp(program, bundle, delay, decisions)})
             print(f"try {number + 1} of {tries} done")
-    ROWS.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(ROWS, lines)
 
 
 def table() -> str:
     """Return a Markdown table: medians over the tries, with the lowest and highest values."""
-    head, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    head, *rows = jsonl.read(ROWS)
     body = []
     for name in NAMES:
         for delay in DELAYS:

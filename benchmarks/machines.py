@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import blocks
+import jsonl
 import numpy as np
 import trainings
 from pages import HERE, insert
@@ -85,12 +85,12 @@ def measure(works: list[Work], rounds: int, seconds: int) -> None:
                     rows.append(work._asdict() | way | {"speed": found})
                     print(rows[-1], flush=True)
     about = {"versions": versions(), "seconds": seconds}
-    blocks.replace(ROWS, about, rows, Work._fields)
+    jsonl.replace(ROWS, about, rows, Work._fields)
 
 
 def table() -> str:
     """Return the medians as Markdown, the best of each line in bold, and how each line was measured."""
-    measured = blocks.read(ROWS)
+    measured = jsonl.blocks(ROWS)
     ways = list(dict.fromkeys((row["processes"], row["seeds"]) for _, rows in measured for row in rows))
     heads = [f"{processes} × {seeds}" for processes, seeds in ways]
     lines, notes = [], []

@@ -6,13 +6,13 @@ writes the tables. A log is a CSV file, read like a user's. The delay is a whole
 
 import argparse
 import csv
-import json
 import tempfile
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import jsonl
 import numpy as np
 from pages import HERE, insert
 
@@ -151,7 +151,7 @@ def run() -> None:
             both = np.cumsum(random.normal(size=(ROWS, 4)), 0) if seed % 2 else random.normal(size=(ROWS, 4))
             write(path, [[0, ROW * t, *row] for t, row in enumerate(both)], 2)
             lines.append({"plant": "unrelated", "seed": seed} | measure(path, 0))
-    RESULTS.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(RESULTS, lines)
 
 
 def score(lines: list[dict[str, Any]], method: str) -> str:
@@ -172,7 +172,7 @@ def table(groups: list[tuple[str, list[dict[str, Any]]]], head: str) -> str:
 
 def tables() -> None:
     """Write the tables into docs/measure.md."""
-    lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
+    lines = jsonl.read(RESULTS)
     own = [line for line in lines if line["plant"] in PLANTS]
     groups = [
         (f"{plant}, noise {noise:.0%}", [c for c in own if (c["plant"], c["noise"]) == (plant, noise)])

@@ -5,10 +5,10 @@ and the table in docs/performance.md; `--table` only the table.
 """
 
 import argparse
-import json
 import time
 from typing import Any
 
+import jsonl
 import numpy as np
 from pages import HERE, insert
 
@@ -51,22 +51,15 @@ def measure(rounds: int, device: str) -> None:
                 began, processor = time.perf_counter(), time.process_time()
                 jax.block_until_ready(program(state, jax.random.key(number)))
                 took = {"wall": time.perf_counter() - began, "processor": time.process_time() - processor}
-                rows.append({"robots": robots, "delay": name, "round": number, **took})
+                rows.append({"name": device, "robots": robots, "delay": name, "round": number, **took})
         print(f"{robots} robots: done", flush=True)
-    about = {"versions": versions(), "steps": STEPS}
-    old = (
-        [line for line in ROWS.read_text().splitlines() if json.loads(line)["name"] != device] if ROWS.exists() else []
-    )
-    new = [json.dumps({"name": device, "about": about, "rows": rows})]
-    ROWS.write_text("\n".join(old + new) + "\n")
+    jsonl.replace(ROWS, {"versions": versions(), "steps": STEPS}, rows, ("name",))
 
 
 def table() -> str:
     """Return a table for each device: time of a step with a delay over that without one, medians over the rounds."""
     parts = []
-    for line in ROWS.read_text().splitlines():
-        made = json.loads(line)
-        about, rows = made["about"], made["rows"]
+    for about, rows in jsonl.blocks(ROWS):
         used = about["versions"]
         clock = "processor" if used["device"] == "cpu" else "wall"
         body = []

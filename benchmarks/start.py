@@ -13,7 +13,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import blocks
+import jsonl
 import numpy as np
 import trainings
 from pages import HERE, insert
@@ -76,13 +76,13 @@ def measure(works: list[Work], rounds: int) -> None:
                     print(rows[-1], flush=True)
             size = sum(file.stat().st_size for file in Path(home, "delayrl").rglob("*") if file.is_file())
             rows[-1]["bytes"] = size
-    blocks.replace(ROWS, {"versions": versions()}, rows, Work._fields)
+    jsonl.replace(ROWS, {"versions": versions()}, rows, Work._fields)
 
 
 def table() -> str:
     """Return the medians as Markdown, and how each line was measured."""
     lines, notes = [], []
-    for about, rows in blocks.read(ROWS):
+    for about, rows in jsonl.blocks(ROWS):
         works: dict[Work, list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
             works[Work(*(row[name] for name in Work._fields))].append(row)
