@@ -6,13 +6,12 @@ from pathlib import Path
 
 import front
 import numpy as np
-from ladder import area
+from ladder import area, read_table
 from learning.curves import difference, spread
 from scipy import stats
 from which import results_of
 
-from delayrl.bench.results import read_table
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, delay_order
 from delayrl.report.statistics import Floats
 

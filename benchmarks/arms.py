@@ -6,7 +6,6 @@ same for all. Each round takes every arm once, so that other work on the machine
 
 import argparse
 import functools
-import json
 import os
 import sys
 import time
@@ -18,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent / "speed"))
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import jax
+import jsonl
 import ladder
 from floor import filled, update
 
@@ -72,4 +72,4 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=15)
     rows = measure(parser.parse_args().rounds)
-    OUT.write_text("".join(json.dumps(row) + "\n" for row in [{"versions": versions()}, *rows]))
+    jsonl.write(OUT, [{"versions": versions()}, *rows])

@@ -5,8 +5,9 @@ adds N episodes on start states that the run never saw (`delayrl evaluate`).
 """
 
 import argparse
-import json
 from pathlib import Path
+
+import jsonl
 
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.play.run import Run
@@ -27,7 +28,7 @@ def collect(out: Path, runs: list[Path], episodes: int = 0, every_delay: bool = 
         if episodes and every_delay:
             lines += [{"run": number, "sweep": result} for result in sweep(path, episodes, seed=run.config["seed"])]
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(out, lines)
 
 
 def main() -> None:

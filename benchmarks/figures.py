@@ -1,7 +1,6 @@
 """Write the pictures and tables of the docs from committed files alone: `python benchmarks/figures.py`."""
 
 import functools
-import json
 import runpy
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 import against
 import forecast
 import front
+import jsonl
 import ladder
 import lost
 import matplotlib
@@ -23,6 +23,7 @@ import which
 matplotlib.use("Agg")
 from learning import curves as learning
 from learning import times
+from pages import HERE, insert
 from PIL import Image
 from speed import tables as speed
 
@@ -31,14 +32,13 @@ from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
 from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
 from delayrl.report.wording import gradient_steps
 from delayrl.run.condition import resolve
 from delayrl.run.cost import Cost
 from delayrl.training.cost import cost_of
 
-HERE = Path(__file__).parent
 COLOURS = {
     "vdpo": "#1f6feb",
     "vdpo reference": "#8c8c8c",
@@ -54,7 +54,7 @@ DETAILS = ("speed-floors", "speed-operations")
 
 def read(name: str) -> tuple[dict[int, dict[str, Any]], list[dict[str, Any]], list[dict[str, Any]]]:
     """Return configurations by run, rows, and evaluations of a results file."""
-    lines = [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
+    lines = jsonl.read(HERE / "results" / f"{name}.jsonl")
     configs = {line["run"]: line["config"] for line in lines if "config" in line}
     return configs, [line for line in lines if "step" in line], [line for line in lines if "evaluation" in line]
 
@@ -134,7 +134,7 @@ def entropies(name: str) -> str:
 
 def overhead() -> str:
     """Return a Markdown table of what the wrappers cost."""
-    first, *lines = [json.loads(line) for line in (HERE / "results" / "overhead.jsonl").read_text().splitlines()]
+    first, *lines = jsonl.read(HERE / "results" / "overhead.jsonl")
     body = []
     for line in lines:
         low, high = line["quartiles"]
@@ -253,14 +253,6 @@ def younger_table(lines: list[dict[str, Any]]) -> str:
     return f"{markdown_table(['travel time, steps', 'held back', 'shown at once (`min_age=0`)'], body)}\n\n{about}"
 
 
-def insert(page: Path, key: str, text: str) -> None:
-    """Replace the text between `<!-- key -->` and `<!-- /key -->` in a page."""
-    content = page.read_text()
-    begin, end = f"<!-- {key} -->", f"<!-- /{key} -->"
-    head, rest = content.split(begin)
-    page.write_text(head + begin + "\n" + text + "\n" + end + rest.split(end)[1])
-
-
 def measured(out: Path) -> None:
     """Draw what `delayrl measure` finds in the log of examples/make_log.py, as docs/measure.md shows it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -289,10 +281,7 @@ def main() -> None:
         insert(root / "docs" / "benchmarks.md", name, table(name) + "\n\n" + provenance(name))
     insert(root / "docs" / "protocols.md", "entropies", entropies("pusher-entropy"))
     insert(root / "docs" / "delays.md", "overhead", overhead())
-    udp, overruns, younger = (
-        [json.loads(line) for line in (HERE / "results" / f"{name}.jsonl").read_text().splitlines()]
-        for name in ("udp", "overruns", "younger")
-    )
+    udp, overruns, younger = (jsonl.read(HERE / "results" / f"{name}.jsonl") for name in ("udp", "overruns", "younger"))
     insert(root / "docs" / "runtime.md", "younger", younger_table(younger))
     insert(root / "docs" / "runtime.md", "overruns", overruns_table(overruns))
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))

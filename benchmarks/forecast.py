@@ -7,13 +7,13 @@ benchmarks/results/forecast.jsonl.
 
 import argparse
 import functools
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
+import jsonl
 import numpy as np
 from jaxtyping import Array
 
@@ -23,7 +23,7 @@ from delayrl.core.forecast import forecast, forecasting
 from delayrl.core.networks import Params
 from delayrl.core.views import network_input, seen_now
 from delayrl.play.policy import Policy
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.run.provenance import versions
 
 OUT = Path(__file__).parent / "results" / "forecast.jsonl"
@@ -98,12 +98,12 @@ def main() -> None:
             run = {"env": config["env"], "delay": own, "seed": config["seed"], "steps": config["schedule"]["steps"]}
             lines.append(run | {"way": way, "returns": returns, "missed": round(missed, 4)})
             print(f"seed {config['seed']}, {way}: {np.mean(returns):,.0f}, missed {missed:.3f}", flush=True)
-    OUT.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(OUT, lines)
 
 
 def section() -> str:
     """Return a Markdown table of the ways by seed, with what made it."""
-    head, *lines = [json.loads(line) for line in OUT.read_text().splitlines()]
+    head, *lines = jsonl.read(OUT)
     returns = {(line["seed"], line["way"]): line["returns"] for line in lines}
     seeds = sorted({seed for seed, _ in returns})
     titles = ["seed", "late, with its forecast", "late, with the true state instead", "no delay"]

@@ -5,13 +5,13 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from ladder import arm, made_on, rows_of, spread, trained_with
+from ladder import arm, made_on, read_table, rows_of, spread, trained_with
 from learning.curves import curve
 from matplotlib import pyplot
 from which import BUDGET, ended, results_of
 
-from delayrl.bench.results import read_table
-from delayrl.report.markdown import markdown_table
+from delayrl.bench.results import Collected
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.wording import interval, normalised
 from delayrl.run.condition import Condition
@@ -53,7 +53,7 @@ def section(files: list[Path], pictures: Path) -> str:
     chosen = choose(results_of(tables))
     draw(chosen, pictures / "result.png")
     shown = [result.condition for result in chosen.values()]
-    runs = itertools.chain(*map(trained_with, files))
+    runs = itertools.chain(*map(trained_with, tables))
     used = [versions for condition, _, own in runs if condition in shown for versions in own]
     *others, last = (f"{count:,} steps on {env}" for env, count in STEPS.items())
     steps = f"{', '.join(others)} and {last}"
@@ -65,7 +65,7 @@ def section(files: list[Path], pictures: Path) -> str:
         "Any-age's critics have layer normalisation, and with `critic_norm=layer` those of SAC and BPQL; those of "
         f"VDPO, lifting and A-SAC have none. {made_on(used)} {rows_of(files, tables)}"
     )
-    return f"{table(chosen, older(files))}\n\n{made}"
+    return f"{table(chosen, older(tables))}\n\n{made}"
 
 
 def choose(results: list[Result]) -> Chosen:
@@ -83,10 +83,10 @@ def comparable(results: list[Result], more: Collection[str] = ()) -> list[Result
     return sorted((r for r in alike if ended(r) and name(r) in {*COLOURS, *more}), key=lambda r: r.runs)
 
 
-def older(files: list[Path]) -> set[tuple[str, Case]]:
+def older(tables: list[Collected]) -> set[tuple[str, Case]]:
     """Return the arms and cases with rows of `OLDER` commits, of agents that act under the delay alone."""
     found = set()
-    for condition, privileged, versions in itertools.chain(*map(trained_with, files)):
+    for condition, privileged, versions in itertools.chain(*map(trained_with, tables)):
         commits = {str(used.get("commit")).partition("-")[0] for used in versions}
         if condition.delay and not privileged and commits & OLDER:
             found.add((in_words(condition, False), (condition.env, condition.delay)))

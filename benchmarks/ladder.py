@@ -4,30 +4,33 @@ All arms have the seeds 0 to n - 1. An arm of any-age is compared with any-age t
 begin with the same random actions, and with the same actor if they have one encoder.
 """
 
-import contextlib
+import functools
 import itertools
-import json
-import sqlite3
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jsonl
 import numpy as np
 from learning.curves import curve, difference, spread
 from matplotlib import pyplot
 from matplotlib.colors import to_hex
 from scipy import stats
 
-from delayrl.bench.results import Collected, read_table
+from delayrl.bench import results as bench
+from delayrl.bench.results import Collected
 from delayrl.errors import DelayRLError
 from delayrl.report import statistics
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
 from delayrl.run.cell import Cell
 from delayrl.run.condition import Condition
+from delayrl.run.folder import versions_in
 
+read_table = functools.cache(bench.read_table)
+"""Several sections of the pages read the same files."""
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,480."""
 BASE, WHOLE = "`bpql`", "`any-age`"
@@ -65,7 +68,7 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
         results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
-    every = [used for file in files for *_, own in trained_with(file) for used in own]
+    every = [used for collected in tables for *_, own in trained_with(collected) for used in own]
     made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
     made += f"seeds, each of ten episodes. {made_on(every)} {rows_of(files, tables)}"
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
@@ -97,15 +100,11 @@ def rows_of(files: list[Path], tables: list[Collected]) -> str:
     return f"Rows, and cells that have ended: {', '.join(named)}."
 
 
-def trained_with(file: Path) -> list[tuple[Condition, bool, list[dict[str, Any]]]]:
+def trained_with(table: Collected) -> list[tuple[Condition, bool, list[dict[str, Any]]]]:
     """Return the condition of each run whose cell has ended, whether it is privileged, and what it was trained with."""
-    query = "SELECT cells.id, cells.cell, shared, versions FROM runs JOIN cells ON cells.id = runs.cell "
-    found = []
-    with contextlib.closing(sqlite3.connect(file)) as table:
-        for id, cell, shared, versions in table.execute(query + "WHERE state = 'done' ORDER BY cells.number"):
-            condition = Cell.from_json(json.loads(cell), id).condition
-            found.append((condition, bool(json.loads(shared).get("privileged")), json.loads(versions)))
-    return found
+    ended = {cell.id: cell.condition for cell, progress in table.standing if progress.state == "done"}
+    runs = (config for config in table.configs if config["cell"] in ended)
+    return [(ended[run["cell"]], run["privileged"], versions_in(run)) for run in runs]
 
 
 def gflop(result: Result) -> str:
@@ -164,7 +163,7 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
 
 def update_times(file: Path) -> dict[str, float]:
     """Return the median ratio of each arm's update to BPQL's over the rounds of arms.py; nothing without its rows."""
-    rows = [json.loads(line) for line in file.read_text().splitlines()[1:]] if file.exists() else []
+    rows = jsonl.read(file)[1:] if file.exists() else []
     known = {row["arm"]: np.array(row["ms"]) for row in rows}
     return {arm: float(np.median(ms / known[BASE])) for arm, ms in known.items()}
 

@@ -7,7 +7,6 @@ process on one thread of one core. The spread over the tries is due to other wor
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -15,20 +14,15 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import jax
+import jsonl
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.agents.registry import AGENTS
-from delayrl.core.types import Spec
 from delayrl.deploy.bundle import BACKENDS
-from delayrl.deploy.export import network_of
 from delayrl.deploy.files import write_files
 from delayrl.deploy.latency import latency
 from delayrl.deploy.packing import pack
-from delayrl.play.policy import Policy
-from delayrl.report.markdown import markdown_table
-from delayrl.run.provenance import versions
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "latency.jsonl"
 SIZES, DT, DELAYS, NAMES = (17, 6), 0.05, (5, 25, 50), ("vdpo", "bpql")
@@ -38,6 +32,13 @@ WORDS = {"numpy": "NumPy", "onnx": "ONNX Runtime", "jax": "JAX", "cpp": "C++ exa
 
 def build(folder: Path, name: str, delay: int) -> Path:
     """Write a bundle with untrained weights and return its folder."""
+    import jax
+
+    from delayrl.agents.registry import AGENTS
+    from delayrl.core.types import Spec
+    from delayrl.deploy.export import network_of
+    from delayrl.play.policy import Policy
+
     agent, spec = AGENTS[name].presets["paper"].agent, Spec(*SIZES, delay)
     policy = Policy(agent, agent.init(spec, jax.random.key(0)), spec, -np.ones(SIZES[1]), np.ones(SIZES[1]))
     write_files(out := folder / f"{name}-{delay}", pack(*network_of(policy), {"agent": name, "dt": DT}))
@@ -54,6 +55,8 @@ def in_cpp(program: Path, bundle: Path, delay: int, decisions: int) -> dict[str,
 
 def measure(tries: int, decisions: int) -> None:
     """Measure every backend on every bundle and write the rows."""
+    from delayrl.run.provenance import versions
+
     package = versions()
     try:
         import onnxruntime
@@ -83,12 +86,12 @@ def measure(tries: int, decisions: int) -> None:
                 if compiler:
                     lines.append(common | {"backend": "cpp", **in_cpp(program, bundle, delay, decisions)})
             print(f"try {number + 1} of {tries} done")
-    ROWS.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(ROWS, lines)
 
 
 def table() -> str:
     """Return a Markdown table: medians over the tries, with the lowest and highest values."""
-    head, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    head, *rows = jsonl.read(ROWS)
     body = []
     for name in NAMES:
         for delay in DELAYS:

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 from front import COLOURS, STEPS, in_words
-from ladder import AWAY, rows_of
+from ladder import AWAY, read_table, rows_of
 from matplotlib import pyplot
 
-from delayrl.bench.results import Collected, read_table
+from delayrl.bench.results import Collected
 from delayrl.errors import DelayRLError
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.run.condition import Condition
 
 ENV = "HalfCheetah-v5"

@@ -5,7 +5,6 @@ all of them learn while the clock runs. Writes rows and the table in docs/perfor
 `--only AGENT` rows of that agent.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -13,15 +12,16 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import blocks
+import jsonl
 import numpy as np
-from figures import HERE, insert
+import trainings
+from pages import HERE, insert
+from trainings import Work
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "machines.jsonl"
-NAMES = ("agent", "delay", "preset")
-WORKS = [("sac", 0, "small"), ("vdpo", 5, "small"), ("vdpo", 25, "small"), ("any-age", 25, "small")]
+WORKS = [Work("sac", 0, "small"), Work("vdpo", 5, "small"), Work("vdpo", 25, "small"), Work("any-age", 25, "small")]
 SEEDS = (1, 4, 8)
 WARM, RANDOM = 300, 1000  # learned steps before the clock runs, and random ones before these
 CHILD = """
@@ -50,23 +50,9 @@ main(words)
 """
 
 
-def speed(work: tuple[str, int, str], shares: list[list[int]], seeds: int, seconds: int, home: Path) -> float:
+def speed(work: Work, shares: list[list[int]], seeds: int, seconds: int, home: Path) -> float:
     """Return the seed-steps a second of processes that learn side by side, each on its share of the cores."""
-    agent, delay, preset = work
-    words = [
-        "train",
-        agent,
-        "--env",
-        "HalfCheetah-v5",
-        "--delay",
-        str(delay),
-        "--preset",
-        preset,
-        "--overwrite",
-        "--quiet",
-    ]
-    words += ["--random-steps", str(RANDOM), "--update-after", str(RANDOM), "--evaluate-every", "200000"]
-    words += ["--steps", "200000", "--replay-capacity", "20000", "--seeds", str(seeds)]
+    words = [*trainings.words(work, 200_000, RANDOM), "--evaluate-every", "200000", "--seeds", str(seeds)]
     children = []
     for number, share in enumerate(shares):
         settings = ",".join(map(str, [RANDOM + WARM, seconds, *share]))
@@ -74,14 +60,14 @@ def speed(work: tuple[str, int, str], shares: list[list[int]], seeds: int, secon
         children.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
     for child in children:
         if child.stdout.readline() != "ready\n":
-            raise RuntimeError(f"{agent} did not learn")
+            raise RuntimeError(f"{work.agent} did not learn")
     for child in children:
         child.stdin.write("go\n")
         child.stdin.flush()
     return seeds * sum(float(child.communicate()[0]) for child in children)
 
 
-def measure(works: list[tuple[str, int, str]], rounds: int, seconds: int) -> None:
+def measure(works: list[Work], rounds: int, seconds: int) -> None:
     """Measure works in turn and write their rows."""
     from delayrl.run.provenance import versions
 
@@ -95,16 +81,16 @@ def measure(works: list[tuple[str, int, str]], rounds: int, seconds: int) -> Non
                     size = len(available) // processes
                     shares = [available[i * size : (i + 1) * size] for i in range(processes)]
                     found = speed(work, shares, seeds, seconds, Path(home))
-                    own = dict(zip(NAMES, work, strict=True))
-                    rows.append(own | {"processes": processes, "seeds": seeds, "round": number, "speed": found})
+                    way = {"processes": processes, "seeds": seeds, "round": number}
+                    rows.append(work._asdict() | way | {"speed": found})
                     print(rows[-1], flush=True)
-    about = {"versions": versions(), "cpus": os.cpu_count(), "seconds": seconds}
-    blocks.replace(ROWS, about, rows, NAMES)
+    about = {"versions": versions(), "seconds": seconds}
+    jsonl.replace(ROWS, about, rows, Work._fields)
 
 
 def table() -> str:
     """Return the medians as Markdown, the best of each line in bold, and how each line was measured."""
-    measured = blocks.read(ROWS)
+    measured = jsonl.blocks(ROWS)
     ways = list(dict.fromkeys((row["processes"], row["seeds"]) for _, rows in measured for row in rows))
     heads = [f"{processes} × {seeds}" for processes, seeds in ways]
     lines, notes = [], []
@@ -117,8 +103,9 @@ def table() -> str:
             cells = [f"**{m:,.0f}**" if m == max(medians) else f"{m:,.0f}" for m in medians]
             lines.append([f"`{agent}`", delay, *cells])
         rounds = 1 + max(row["round"] for row in rows)
-        words = f"{rounds} rounds of {about['seconds']} s, {about['cpus']} x86 cores, jax {about['versions']['jax']}"
-        notes.append(f"{', '.join(f'`{agent}`' for agent in agents)}: {words}, commit {about['versions']['commit']}.")
+        used = about["versions"]
+        words = f"{rounds} rounds of {about['seconds']} s, {used['cores']} x86 cores, jax {used['jax']}"
+        notes.append(f"{', '.join(f'`{agent}`' for agent in agents)}: {words}, commit {used['commit']}.")
     words = (
         "Seed-steps a second, processes × seeds of each; medians of rounds of learning, HalfCheetah-v5, preset `small`."
     )
@@ -127,12 +114,9 @@ def table() -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser = trainings.parser(__doc__, WORKS)
     parser.add_argument("--seconds", type=int, default=10)
-    parser.add_argument("--table", action="store_true", help="write the table alone")
-    parser.add_argument("--only", metavar="AGENT", choices=sorted({agent for agent, *_ in WORKS}))
     given = parser.parse_args()
     if not given.table:
-        measure([work for work in WORKS if given.only in (None, work[0])], given.rounds, given.seconds)
+        measure([work for work in WORKS if given.only in (None, work.agent)], given.rounds, given.seconds)
     insert(HERE.parent / "docs" / "performance.md", "machines", table())

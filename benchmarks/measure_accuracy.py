@@ -1,29 +1,28 @@
 """Test how well `delayrl measure LOG` recovers known delays: `python benchmarks/measure_accuracy.py`, some minutes.
 
-Writes one row for each log to results/measure.jsonl, and from these rows the tables of docs/measure.md. `--tables` only
+Writes one row for each log to results/measure.jsonl, and from these rows the tables of docs/measure.md. `--table` only
 writes the tables. A log is a CSV file, read like a user's. The delay is a whole number of rows, 0 to 11.
 """
 
 import argparse
 import csv
-import json
 import tempfile
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import jsonl
 import numpy as np
+from pages import HERE, insert
 
 from delayrl.envs.making import make as make_task
 from delayrl.errors import DelayRLError
 from delayrl.measure import from_log
 from delayrl.measure.reading import Table, read_signals
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
-HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "measure.jsonl"
-PAGE = HERE.parent / "docs" / "measure.md"
 ROW, ROWS, LONGEST, SEEDS = 0.02, 2000, 40, 3
 PLANTS = ("gain", "integrator", "servo", "second order")
 COMMANDS = ("white", "smooth", "held", "policy")
@@ -152,7 +151,7 @@ def run() -> None:
             both = np.cumsum(random.normal(size=(ROWS, 4)), 0) if seed % 2 else random.normal(size=(ROWS, 4))
             write(path, [[0, ROW * t, *row] for t, row in enumerate(both)], 2)
             lines.append({"plant": "unrelated", "seed": seed} | measure(path, 0))
-    RESULTS.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(RESULTS, lines)
 
 
 def score(lines: list[dict[str, Any]], method: str) -> str:
@@ -173,7 +172,7 @@ def table(groups: list[tuple[str, list[dict[str, Any]]]], head: str) -> str:
 
 def tables() -> None:
     """Write the tables into docs/measure.md."""
-    lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
+    lines = jsonl.read(RESULTS)
     own = [line for line in lines if line["plant"] in PLANTS]
     groups = [
         (f"{plant}, noise {noise:.0%}", [c for c in own if (c["plant"], c["noise"]) == (plant, noise)])
@@ -200,14 +199,12 @@ def tables() -> None:
         f"{sum(np.logical_and(wide, np.logical_not(wrong)))}. "
         "Results: `benchmarks/results/measure.jsonl`."
     )
-    page = PAGE.read_text()
-    head, rest = page.split("<!-- accuracy -->")
-    PAGE.write_text(head + "<!-- accuracy -->\n" + text + "\n<!-- /accuracy -->" + rest.split("<!-- /accuracy -->")[1])
+    insert(HERE.parent / "docs" / "measure.md", "accuracy", text)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tables", action="store_true", help="only rewrite the tables")
-    if not parser.parse_args().tables:
+    parser.add_argument("--table", action="store_true", help="only rewrite the tables")
+    if not parser.parse_args().table:
         run()
     tables()

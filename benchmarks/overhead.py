@@ -4,13 +4,13 @@ The task is HalfCheetah-v5. Writes benchmarks/results/overhead.jsonl, from which
 """
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jsonl
 import numpy as np
 
 from delayrl.envs.task import quiet
@@ -63,8 +63,7 @@ def main() -> None:
         low, middle, high = np.percentile(values, [25, 50, 75]).round(3).tolist()
         lines.append({"wrapper": name, "environments": count, "ratio": middle, "quartiles": [low, high]})
         print(f"\n{name}, {count}: {middle} ({low} to {high})", end="", file=sys.stderr)
-    out = Path(__file__).parent / "results" / "overhead.jsonl"
-    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(Path(__file__).parent / "results" / "overhead.jsonl", lines)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jsonl
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "udp_demo"))
@@ -80,7 +81,7 @@ def main() -> None:
             controller = Controller(player, on_overrun=on_overrun)
             lines.append({"link": asdict(link), "answer": name, "returns": returns(env, controller, link)})
             print(link, name, np.mean(lines[-1]["returns"]), flush=True)
-    out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(out, lines)
 
 
 if __name__ == "__main__":

@@ -4,16 +4,16 @@
 """
 
 import argparse
-import json
 import runpy
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import jsonl
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "ppo.jsonl"
 VIEWS = ("blind", "augmented", "privileged")
@@ -21,7 +21,7 @@ VIEWS = ("blind", "augmented", "privileged")
 
 def collect(folders: list[Path]) -> None:
     """Write the rows of run folders, after a line with the options of each task and the versions that made the rows."""
-    rows = [json.loads(line) for folder in folders for line in (folder / "rows.jsonl").read_text().splitlines()]
+    rows = [row for folder in folders for row in jsonl.read(folder / "rows.jsonl")]
     options: dict[str, dict[str, Any]] = {}
     versions: list[dict[str, Any]] = []
     for row in rows:
@@ -30,13 +30,12 @@ def collect(folders: list[Path]) -> None:
             raise SystemExit(f"{row['task']}: runs of other options are among these: {used} and {options[row['task']]}")
         if (made := row.pop("versions")) not in versions:
             versions.append(made)
-    lines = [{"options": options, "versions": versions}, *rows]
-    ROWS.write_text("\n".join(map(json.dumps, lines)) + "\n")
+    jsonl.write(ROWS, [{"options": options, "versions": versions}, *rows])
 
 
 def table() -> str:
     """Return final returns and returns over training, means and standard deviations over seeds, as Markdown."""
-    about, *rows = (json.loads(line) for line in ROWS.read_text().splitlines())
+    about, *rows = jsonl.read(ROWS)
     curves: dict[tuple[str, str, str], dict[int, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
     seconds: dict[str, dict[Any, float]] = defaultdict(dict)  # by task and run
     for row in rows:
@@ -67,8 +66,5 @@ if __name__ == "__main__":
     if given.folders:
         collect(given.folders)
     draw = runpy.run_path(str(HERE.parent / "examples" / "ppo_brax.py"))["draw"]
-    draw(
-        [row for line in ROWS.read_text().splitlines() if "view" in (row := json.loads(line))],
-        HERE.parent / "docs/img/ppo.png",
-    )
+    draw(jsonl.read(ROWS)[1:], HERE.parent / "docs/img/ppo.png")
     insert(HERE.parent / "docs" / "simulators.md", "ppo", table())

@@ -6,7 +6,6 @@ Writes benchmarks/results/precision.jsonl.
 """
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jsonl
 import numpy as np
 from jaxtyping import Array
 
@@ -79,9 +79,9 @@ def main() -> int:
         errors = [list(map(distance, measure(bits, seed), right)) for seed, right in enumerate(exact)]
         action_error, gradient_error = np.median(errors, 0).tolist()
         row = {"precision": name, "action": action_error, "gradient": gradient_error, "seeds": 5}
-        lines.append(json.dumps(row | {"date": time.strftime("%Y-%m-%d"), "versions": versions()}))
+        lines.append(row | {"date": time.strftime("%Y-%m-%d"), "versions": versions()})
         print(row, file=sys.stderr)
-    OUT.write_text("\n".join(lines) + "\n")
+    jsonl.write(OUT, lines)
     return 0
 
 

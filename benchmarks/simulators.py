@@ -5,15 +5,14 @@ and the table in docs/performance.md; `--table` only the table.
 """
 
 import argparse
-import json
-import os
 import time
 from typing import Any
 
+import jsonl
 import numpy as np
-from figures import HERE, insert
+from pages import HERE, insert
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 ROWS = HERE / "results" / "simulators.jsonl"
 DELAYS = ("5", "50", "uniform:1:5", "uniform:1:50", "episode:1:5+action=episode:0:5")
@@ -52,23 +51,17 @@ def measure(rounds: int, device: str) -> None:
                 began, processor = time.perf_counter(), time.process_time()
                 jax.block_until_ready(program(state, jax.random.key(number)))
                 took = {"wall": time.perf_counter() - began, "processor": time.process_time() - processor}
-                rows.append({"robots": robots, "delay": name, "round": number, **took})
+                rows.append({"name": device, "robots": robots, "delay": name, "round": number, **took})
         print(f"{robots} robots: done", flush=True)
-    about = {"versions": versions(), "cpus": os.cpu_count(), "device": jax.devices()[0].device_kind, "steps": STEPS}
-    old = (
-        [line for line in ROWS.read_text().splitlines() if json.loads(line)["name"] != device] if ROWS.exists() else []
-    )
-    new = [json.dumps({"name": device, "about": about, "rows": rows})]
-    ROWS.write_text("\n".join(old + new) + "\n")
+    jsonl.replace(ROWS, {"versions": versions(), "steps": STEPS}, rows, ("name",))
 
 
 def table() -> str:
     """Return a table for each device: time of a step with a delay over that without one, medians over the rounds."""
     parts = []
-    for line in ROWS.read_text().splitlines():
-        made = json.loads(line)
-        about, rows = made["about"], made["rows"]
-        clock = "processor" if about["device"] == "cpu" else "wall"
+    for about, rows in jsonl.blocks(ROWS):
+        used = about["versions"]
+        clock = "processor" if used["device"] == "cpu" else "wall"
         body = []
         for robots in ROBOTS:
             times = {
@@ -79,8 +72,7 @@ def table() -> str:
             ratios = [f"{np.median(times[delay] / times['']):.2f}" for delay in DELAYS]
             body.append([f"{robots:,}", f"{plain:.1f}", *ratios])
         rounds = 1 + max(row["round"] for row in rows)
-        kind = f"{about['cpus']} x86 cores, processor time" if clock == "processor" else f"{about['device']}, wall time"
-        used = about["versions"]
+        kind = f"{used['cores']} x86 cores, processor time" if clock == "processor" else f"{used['device']}, wall time"
         table = markdown_table(["robots", "without, ms a step", *(f"`{delay}`" for delay in DELAYS)], body)
         parts.append(f"{table}\n\nMedian of {rounds} rounds in turn; {kind}; jax {used['jax']}.")
     return "\n\n".join(parts) + " Rows: `benchmarks/results/simulators.jsonl`."

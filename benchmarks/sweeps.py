@@ -1,13 +1,13 @@
 """Returns of one policy at every constant delay that it serves, from the rows of `collect.py … --every-delay`."""
 
-import json
 from pathlib import Path
 
+import jsonl
 import numpy as np
 from matplotlib import pyplot
 from numpy.typing import NDArray
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 Sweeps = dict[str, NDArray[np.float64]]
 """Mean returns by agent, [seeds, delays]; the delays are 0, 1, …"""
@@ -18,7 +18,7 @@ SHOWN = 5
 def read(file: Path) -> Sweeps:
     """Return the mean returns in a file of rows."""
     returns: dict[str, dict[int, dict[int, float]]] = {}
-    for line in map(json.loads, file.read_text().splitlines()):
+    for line in jsonl.read(file):
         if "sweep" in line:
             found = line["sweep"]
             runs = returns.setdefault(found["agent"], {})
@@ -55,7 +55,7 @@ def table(seeds: NDArray[np.float64]) -> str:
 
 def section(file: Path, agent: str) -> str:
     """Return the table of one agent's rows, with what made them."""
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    lines = jsonl.read(file)
     config = next(line["config"] for line in lines if "config" in line)
     episodes = next(line["sweep"]["episodes"] for line in lines if "sweep" in line)
     versions, seeds = config["versions"], read(file)[agent]

@@ -105,8 +105,8 @@ def latching(axes: Any) -> None:
             for delay in delays
         ]
 
-    best = [tab.optimal_return(tab.augment(mdp, delay).mdp) for delay in delays]
     curves = {
+        "best delayed policy": [tab.optimal_return(tab.augment(mdp, delay).mdp) for delay in delays],
         "reverse, own data": returns("delayed", False),
         "reverse, argmin data": returns("lower_q", False),
         "reverse, reference's data": returns("reference", False),
@@ -114,50 +114,26 @@ def latching(axes: Any) -> None:
         "forward, argmin data": returns("lower_q", True),
         "forward, reference's data (Eq. 6)": returns("reference", True),
     }
-    row("best delayed policy", best)
     for label, values in curves.items():
         row(label, values)
     bpql = [fix.bpql_fixed_point(mdp, delay, temperature).policy for delay in delays]
     adsac = [fix.adsac_fixed_point(mdp, delay, temperature, data="lower_q").policy for delay in delays]
     for label, policies in (("BPQL", bpql), ("AD-SAC, argmin data", adsac)):
         row(label, [tab.policy_return(tab.augment(mdp, d).mdp, p) for d, p in zip(delays, policies, strict=True)])
-    axes.plot(delays, best, color=GREY, lw=4, alpha=0.45, label="best delayed policy")
-    axes.plot(delays, curves["reverse, own data"], color=BLUE, marker="o", ms=4, label="reverse KL, own data")
-    axes.plot(
-        delays,
-        curves["reverse, argmin data"],
-        color=BLUE,
-        marker="x",
-        ms=8,
-        ls="none",
-        label="reverse KL, argmin data",
+    own, argmin, reference = (
+        {"marker": "o", "ms": 4},
+        {"marker": "x", "ms": 8, "ls": "none"},
+        {"marker": "v", "ms": 5, "ls": "--"},
     )
-    axes.plot(
-        delays,
-        curves["forward, own data (Eq. 7)"],
-        color=ORANGE,
-        marker="o",
-        ms=4,
-        label="forward KL, own data",
-    )
-    axes.plot(
-        delays,
-        curves["reverse, reference's data"],
-        color=BLUE,
-        marker="v",
-        ms=5,
-        ls="--",
-        label="reverse KL, reference's data",
-    )
-    axes.plot(
-        delays,
-        curves["forward, reference's data (Eq. 6)"],
-        color=ORANGE,
-        marker="v",
-        ms=5,
-        ls="--",
-        label="forward KL, reference's data",
-    )
+    for key, colour, style, label in (
+        ("best delayed policy", GREY, {"lw": 4, "alpha": 0.45}, "best delayed policy"),
+        ("reverse, own data", BLUE, own, "reverse KL, own data"),
+        ("reverse, argmin data", BLUE, argmin, "reverse KL, argmin data"),
+        ("forward, own data (Eq. 7)", ORANGE, own, "forward KL, own data"),
+        ("reverse, reference's data", BLUE, reference, "reverse KL, reference's data"),
+        ("forward, reference's data (Eq. 6)", ORANGE, reference, "forward KL, reference's data"),
+    ):
+        axes.plot(delays, curves[key], color=colour, label=label, **style)
     axes.axhline(0.5 / (1 - mdp.discount), color="black", lw=0.8, ls=":")
     axes.annotate("the same action for ever", (1.95, 9.62), fontsize=9)
     axes.set(

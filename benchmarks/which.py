@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ladder import rows_of
+from ladder import read_table, rows_of
 
-from delayrl.bench.results import Collected, read_table
-from delayrl.report.markdown import markdown_table
+from delayrl.bench.results import Collected
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, delay_order
 from delayrl.report.statistics import FEWEST, improvement_interval
 from delayrl.report.summary import summarise

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jsonl
 import numpy as np
 from overruns import Link, returns
 
@@ -44,7 +45,7 @@ def main() -> None:
                 totals = returns(env, Controller(policy, min_age=min_age), link)
                 lines.append({"link": asdict(link), "seed": config["seed"], "min_age": min_age, "returns": totals})
             print(link, config["seed"], [round(np.mean(line["returns"])) for line in lines[-2:]], flush=True)
-    given.out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    jsonl.write(given.out, lines)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from scipy import stats
 
 from delayrl.report import statistics
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 COLOURS = {"delayrl": "#1f6feb", "SBX": "#d1242f", "Stable-Baselines3": "#1a7f37", "delayrl, matched": "#8250df"}
 COLOURS |= {"delayrl, matched, bfloat16": "#c07ff0", "delayrl, small": "#9a6700"}

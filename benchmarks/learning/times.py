@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import pyplot
 
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 
 RETURNS = (1_000, 2_000, 3_000)
 OURS = "`any-age`, `small`"

@@ -13,7 +13,7 @@ from matplotlib import pyplot
 from speed.works import OWN, SIZES
 
 from delayrl.bench.results import read_table
-from delayrl.report.markdown import markdown_table
+from delayrl.report.markup import markdown_table
 from delayrl.run.folder import versions_in
 
 RESULTS = Path(__file__).parent.parent / "results"

@@ -211,18 +211,18 @@ class Collected(NamedTuple):
 
     rows: list[Row]  # as `rows_of` yields them
     standing: list[tuple[Cell, Progress]]  # its cells, and how far each was
-    configs: list[dict[str, Any]]  # the configuration of each run
+    configs: list[dict[str, Any]]  # the configuration of each run, with its cell's id
     description: str  # of the grid
 
 
 def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
-    """Return the configurations of the runs that have begun."""
+    """Return the configurations of the runs that have begun, each with its cell's id."""
     configs = []
     for cell in cells:
         for path in folders.seed_paths(runs / cell.folder, cell.seeds):
             if (run := RunFolder(path)).exists:
                 try:
-                    configs.append(run.config)
+                    configs.append(run.config | {"cell": cell.id})
                 except DelayRLError as error:
                     raise DelayRLError(f"{error}: {folders.again(path.parent)}") from error
     return configs
@@ -253,10 +253,10 @@ def _read(table: sqlite3.Connection, id: str | None = None) -> Collected:
         for run, more, *values in table.execute(query, given)
     ]
     configs = []
-    for *_, text, used in runs:
+    for _, cell, _, text, used in runs:
         first, *later = _loaded(used, list) or [{}]
         made = {"versions": first, "later_versions": later} if later else {"versions": first}
-        configs.append(_loaded(text, dict) | made)
+        configs.append(_loaded(text, dict) | made | {"cell": cell})
         check_more(configs[-1], "a configuration")
     description = table.execute("SELECT value FROM meta WHERE key = 'description'").fetchone() or [""]
     return Collected(rows, cells, configs, str(description[0]))

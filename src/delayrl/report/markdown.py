@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from delayrl.errors import count
 from delayrl.report import wording
 from delayrl.report.comparisons import Comparison
+from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, Setting, agent_order
 from delayrl.report.statistics import mean_std
 from delayrl.report.summary import Aggregate, Summary
@@ -56,11 +57,6 @@ def _escape(text: object) -> str:
     """Make text that Markdown and its tables take literally."""
     plain = html.escape(" ".join(str(text).split()), quote=False)
     return re.sub(r"([\\`*_\[\]|~$#!])", r"\\\1", plain)
-
-
-def markdown_table(head: Sequence[str], body: Iterable[Sequence[object]]) -> str:
-    """Write a table of cells that are Markdown already."""
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, ["---" for _ in head], *body))
 
 
 def _paper_table(summary: Summary, table: Table) -> str:
