@@ -10,6 +10,9 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import figures  # noqa: E402
+import ppo  # noqa: E402
+
+from delayrl.cli.main import main as delayrl  # noqa: E402
 
 
 def section(page: str, key: str) -> str:
@@ -63,3 +66,17 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/algorithms/any-age.md", "against-poles") == poles
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
     assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])
+
+
+THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in ("evidence-1", "evidence-2")]
+
+
+@pytest.mark.parametrize("name", ["first", *THOROUGH])
+def test_reports(name: str, tmp_path: Path) -> None:
+    folder = ROOT / "docs" / "results" / ("" if name == "first" else name)
+    delayrl(["bench", "report", str(*tables(name)), "--out", str(tmp_path)])
+    assert (folder / "report.md").read_text() == (tmp_path / "report.md").read_text()
+
+
+def test_ppo() -> None:
+    assert section("docs/simulators.md", "ppo") == ppo.table()
