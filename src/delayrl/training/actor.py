@@ -75,5 +75,5 @@ class Actor:
             self._refuse("an observation")
 
     def _refuse(self, what: str) -> None:
-        at = f"step {len(self.actions)}, episode {self.episode}"
+        at = f"step {len(self.actions)}, episode {self.episode} of seed {self.seed}"
         raise DelayRLError(f"the environment gave {what} that is not finite: {at}")
