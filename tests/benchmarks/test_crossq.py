@@ -1,23 +1,19 @@
 """The ladder's arm with CrossQ's critics: against batch norm written out, and trained by its name."""
 
-import sys
 from pathlib import Path
 
+import crossq
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks")]
-
-import crossq  # noqa: E402
-
-import delayrl  # noqa: E402
-from conftest import record  # noqa: E402
-from delayrl.core import networks  # noqa: E402
-from delayrl.core import replay as ring  # noqa: E402
-from delayrl.core.types import Spec, Window  # noqa: E402
+import delayrl
+from conftest import record
+from delayrl.core import networks
+from delayrl.core import replay as ring
+from delayrl.core.types import Spec, Window
 
 SPEC = Spec(10, 2, 3)
 AGENT = crossq.CrossQ(

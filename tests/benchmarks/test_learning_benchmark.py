@@ -5,24 +5,20 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import front
+import ladder
 import numpy as np
 import pytest
+import timed
+from learning import times
 from scipy import stats
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "learning")]
-
-import front  # noqa: E402
-import ladder  # noqa: E402
-import timed  # noqa: E402
-from learning import times  # noqa: E402
-
-import delayrl  # noqa: E402
-from delayrl.report.results import NO_ANCHOR, Anchor, Curves, Place, Result, Setting  # noqa: E402
-from delayrl.run.cell import Cell, Progress  # noqa: E402
-from delayrl.run.condition import Condition  # noqa: E402
-from delayrl.run.cost import Cost  # noqa: E402
-from delayrl.training.recorder import Recorder  # noqa: E402
+import delayrl
+from delayrl.report.results import NO_ANCHOR, Anchor, Curves, Place, Result, Setting
+from delayrl.run.cell import Cell, Progress
+from delayrl.run.condition import Condition
+from delayrl.run.cost import Cost
+from delayrl.training.recorder import Recorder
 
 
 def write(folder: Path, side: str, seed: int, returns: list[float | None]) -> None:

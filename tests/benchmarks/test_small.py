@@ -4,13 +4,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import small
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks")]
-
-import small  # noqa: E402
-
-import delayrl  # noqa: E402
-from delayrl.run.folder import RunFolder  # noqa: E402
+import delayrl
+from delayrl.run.folder import RunFolder
 
 CONFIG = {"agent": "sac", "preset": "small", "env": "X-v0", "delay": 0, "hyperparameters": {}, "schedule": {"steps": 9}}
 
