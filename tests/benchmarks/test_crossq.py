@@ -10,9 +10,8 @@ import optax
 import pytest
 
 import delayrl
-from conftest import record
+from conftest import record, replay_of, sample
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.types import Spec, Window
 
 SPEC = Spec(10, 2, 3)
@@ -25,10 +24,7 @@ update = jax.jit(AGENT.update)
 @pytest.fixture(scope="module")
 def windows() -> Window:
     transitions, _ = record("Reacher-v5", 3, 120)
-    replay = ring.init(SPEC, 200)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    return jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 16, 3, 3, jnp.int32(0))
+    return sample(replay_of(transitions, SPEC, 200), jax.random.key(0), 16, 3, 3, jnp.int32(0))
 
 
 def written_out(critic: dict, x: np.ndarray) -> np.ndarray:
