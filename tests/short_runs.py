@@ -1,5 +1,6 @@
 """Runs of a few hundred steps with tiny networks; and what an installed package says of itself."""
 
+import errno
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -47,6 +48,11 @@ def train(agent: str, out: Path, **values):
     }
     options |= tiny | values
     return delayrl.train(agent, **options)
+
+
+def full_disk(handle: int) -> None:
+    """In place of `os.fsync`: the disk is full."""
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 class KilledError(Exception):

@@ -47,6 +47,11 @@ def same(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+def assert_near(a, b) -> None:
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
+
+
 def seen(delay: int, age: int, rng: np.random.Generator, truth: bool = False) -> Seen:
     actions = np.zeros((delay, ACT), np.float32)
     actions[:age] = rng.uniform(-1, 1, (age, ACT))
