@@ -45,8 +45,13 @@ def main() -> None:
         out = Path("runs/small") / given.task / agent
         delayrl.train(agent, preset="small", seeds=3, out=out, progress=False, **values)
         print(f"{agent}: done", flush=True)
-    complete = [path for path in sorted(Path("runs/small", given.task).glob("*/seed*")) if is_complete(path)]
+    complete = complete_runs(Path("runs/small", given.task))
     collect(Path(__file__).parent / "results" / f"{given.task}.jsonl", complete, 20, every_delay=kind != given.task)
+
+
+def complete_runs(folder: Path) -> list[Path]:
+    """Return the runs of a task that have ended."""
+    return [path for path in sorted(folder.glob("*/seed*")) if is_complete(path)]
 
 
 def is_complete(path: Path) -> bool:

@@ -51,6 +51,8 @@ from delayrl.agents.dida import DIDA  # noqa: E402
 from delayrl.agents.lifting import Lifting  # noqa: E402
 from delayrl.agents.sac import BPQL, SAC  # noqa: E402
 from delayrl.agents.vdpo import VDPO  # noqa: E402
+from delayrl.core import replay as ring  # noqa: E402
+from delayrl.core.types import Spec, Transition  # noqa: E402
 from delayrl.delays import Delay  # noqa: E402
 from delayrl.envs.making import make  # noqa: E402
 from delayrl.play.run import Run  # noqa: E402
@@ -156,3 +158,17 @@ def record(env: str, delay: int | str | Delay, steps: int, seed: int = 0) -> tup
         shown.append(actor.seen)
         transitions.append(actor.step(rng.uniform(-1, 1, actor.env.action_space.shape).astype(np.float32)))
     return transitions, shown
+
+
+append = jax.jit(ring.append, static_argnames="learnable")
+sample = jax.jit(ring.sample, static_argnames=("batch", "delay", "ahead", "learnable"))
+
+
+def replay_of(
+    transitions: Iterable[Transition], spec: Spec, capacity: int, learnable: ring.Learnable = ring.ALL
+) -> ring.Replay:
+    """A replay that got transitions one by one."""
+    replay = ring.init(spec, capacity)
+    for transition in transitions:
+        replay = append(replay, transition, learnable)
+    return replay

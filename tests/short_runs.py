@@ -1,5 +1,9 @@
 """Runs of a few hundred steps with tiny networks; and what an installed package says of itself."""
 
+import errno
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +11,11 @@ import pytest
 
 import delayrl
 from delayrl.cli.main import main
+from delayrl.core.types import Transition
 from delayrl.play.run import Run
 from delayrl.run.checkpoint import Checkpoint
 from delayrl.run.folder import RunFolder, RunLike
+from delayrl.training.actor import Actor
 from delayrl.training.loop import Loop
 
 TINY = {
@@ -44,6 +50,11 @@ def train(agent: str, out: Path, **values):
     return delayrl.train(agent, **options)
 
 
+def full_disk(handle: int) -> None:
+    """In place of `os.fsync`: the disk is full."""
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 class KilledError(Exception):
     """Ends a run where it is."""
 
@@ -70,6 +81,29 @@ def newest(run: RunLike) -> Checkpoint:
 
 def arrays(run: RunLike) -> dict[str, np.ndarray]:
     return newest(run).arrays("agent")
+
+
+def assert_same_networks(one: RunLike, other: RunLike) -> None:
+    """The newest checkpoints of two runs hold the same arrays of the agent, its optimisers' included, bit for bit."""
+    mine, theirs = arrays(one), arrays(other)
+    assert mine.keys() == theirs.keys()
+    for name, array in mine.items():
+        np.testing.assert_array_equal(array, theirs[name], name, strict=True)
+
+
+@contextmanager
+def at_step(number: int, call: Callable[[], object]) -> Iterator[None]:
+    """Call something just before the environment step of this number."""
+    step, steps = Actor.step, itertools.count(1)
+
+    def counted(self: Actor, action: np.ndarray) -> Transition:
+        if next(steps) == number:
+            call()
+        return step(self, action)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Actor, "step", counted)
+        yield
 
 
 def declare(folder: Path, group: str, **points: str) -> None:

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from conftest import learned, record
-from delayrl.core import replay as ring
+from conftest import learned, record, replay_of, sample
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.training.learner import Program
 
@@ -33,25 +32,24 @@ def trained(agent, delay: int, updates: int = 12, hidden: int = 0, transitions=N
 
 def sampled(transitions, spec: Spec, batch: int, ahead: int) -> Window:
     """Windows of a replay that holds transitions."""
-    replay, append = ring.init(spec, 300), jax.jit(ring.append)
-    for transition in transitions:
-        replay = append(replay, transition)
-    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+    replay = replay_of(transitions, spec, 300)
     return sample(replay, jax.random.key(0), batch, spec.delay, ahead, jnp.int32(0))
 
 
 def counted(delay: int, steps: int, batch: int, ahead: int, law: str | None = None):
     """Random play of the counter, under a random delay if there is a law, and windows of it."""
     transitions, _ = record("delayrl/Counter-v0", law or delay, steps)
-    replay = ring.init(Spec(2, 1, delay), 2 * steps)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
+    replay = replay_of(transitions, Spec(2, 1, delay), 2 * steps)
     return transitions, sample(replay, jax.random.key(0), batch, delay, ahead, jnp.int32(0))
 
 
 def same(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def assert_near(a, b) -> None:
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
 
 
 def seen(delay: int, age: int, rng: np.random.Generator, truth: bool = False) -> Seen:

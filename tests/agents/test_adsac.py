@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from learners import same, sampled
+from learners import assert_near, same, sampled
 
 from conftest import record
 from delayrl.agents.adsac import ADSAC, State, augmented_learner, with_augmented
@@ -19,11 +19,6 @@ from delayrl.errors import DelayRLError
 ENV, OBS, ACT, DELAY = "Reacher-v5", 10, 2, 3
 SPEC = Spec(OBS, ACT, DELAY)
 TINY = SAC(actor_sees="augmented", critic_sees="augmented", hidden=(16, 16), batch_size=16)
-
-
-def near(a, b) -> None:
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
 
 
 @functools.cache
@@ -127,10 +122,10 @@ def test_equal_delays_are_a_sac() -> None:
 
     short = agent.improve_auxiliary(state, now, policy_key)
     assert same(short._replace(auxiliary=auxiliary), state)
-    near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, -2.0, temperature_key), expected)
+    assert_near(agent.learner.adjust_temperature(short.auxiliary, now.auxiliary, -2.0, temperature_key), expected)
     long = agent.improve_augmented(state, now, policy_key)
     assert same(long.auxiliary, auxiliary)
-    near((long.actor, long.actor_opt_state), (expected.actor, expected.actor_opt_state))
+    assert_near((long.actor, long.actor_opt_state), (expected.actor, expected.actor_opt_state))
     assert same((long.actor, long.actor_opt_state), (short.auxiliary.actor, short.auxiliary.actor_opt_state))
 
 
@@ -148,7 +143,9 @@ def test_a_round_is_its_parts() -> None:
         expected = improve[coin](state, keys[0])
         short = adjust(expected.auxiliary, now.auxiliary, keys[1])
         own = adjust(augmented_learner(expected), now.augmented, keys[2])
-        near(whole(jax.random.key(count), jnp.int32(count)), with_augmented(expected._replace(auxiliary=short), own))
+        assert_near(
+            whole(jax.random.key(count), jnp.int32(count)), with_augmented(expected._replace(auxiliary=short), own)
+        )
         took.add(coin)
     assert took == {0, 1}
 

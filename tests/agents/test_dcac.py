@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from conftest import record
+from conftest import record, replay_of, sample
 from delayrl.agents.base import reference_of
 from delayrl.agents.dcac import DCAC, Roll, values
 from delayrl.agents.registry import AGENTS
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import network_input, view
 from delayrl.errors import DelayRLError
@@ -23,14 +22,6 @@ from delayrl.training.checks import check_agent
 AGENT = DCAC(hidden=(16, 16), batch_size=16)
 DELAY = 4
 COUNTER = Spec(2, 1, DELAY)
-sample = jax.jit(ring.sample, static_argnums=(2, 3, 4))
-
-
-def store(transitions, spec: Spec) -> ring.Replay:
-    replay, append = ring.init(spec, 300), jax.jit(ring.append)
-    for transition in transitions:
-        replay = append(replay, transition)
-    return replay
 
 
 @functools.cache
@@ -41,7 +32,7 @@ def counter(kind: str) -> Window:
         transitions = [t._replace(terminated=np.bool_(False)) for t in transitions]
     if kind == "random":  # ages such as a random delay from 1..4 makes them, late observations ignored
         transitions = [t._replace(age=age_at(t.obs), next_age=age_at(t.next_obs)) for t in transitions]
-    return sample(store(transitions, COUNTER), jax.random.key(0), 600, DELAY, DELAY, jnp.int32(2))
+    return sample(replay_of(transitions, COUNTER, 300), jax.random.key(0), 600, DELAY, DELAY, jnp.int32(2))
 
 
 def age_at(obs: np.ndarray) -> np.int32:
@@ -187,7 +178,8 @@ def test_the_delay_holds_the_terminal_state_back() -> None:
 def parts():
     transitions, _ = record("Reacher-v5", 3, 60)
     spec = Spec(10, 2, 3)
-    return AGENT.init(spec, jax.random.key(0)), sample(store(transitions, spec), jax.random.key(0), 16, 3, 3, 0)
+    windows = sample(replay_of(transitions, spec, 300), jax.random.key(0), 16, 3, 3, 0)
+    return AGENT.init(spec, jax.random.key(0)), windows
 
 
 def test_gradients() -> None:
@@ -301,7 +293,7 @@ def test_act() -> None:
 @pytest.mark.parametrize("delay", ["uniform:1:4", "uniform:1:4@raw", "gilbert:1:4:0.3:0.3@fifo"])
 def test_a_stretch_counts_what_arrived_in_it(delay: str) -> None:
     """Rewards from the first look's state to the last one's, each once, also where a look goes back in time."""
-    replay = store(record("delayrl/Counter-v0", delay, 200)[0], COUNTER)
+    replay = replay_of(record("delayrl/Counter-v0", delay, 200)[0], COUNTER, 300)
     windows = sample(replay, jax.random.key(0), 512, DELAY, DELAY, jnp.int32(0))
     actor = AGENT.init(COUNTER, jax.random.key(0)).actor
     rolls, windows = jax.device_get((jax.jit(AGENT.roll)(actor, windows, jax.random.key(1)), windows))

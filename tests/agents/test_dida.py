@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from learners import same
 
-from conftest import learned, record
+from conftest import learned, record, replay_of, sample
 from delayrl.agents.base import Schedule
 from delayrl.agents.dida import DIDA
 from delayrl.agents.sac import SAC
-from delayrl.core import replay as ring
 from delayrl.core.networks import mode
 from delayrl.core.types import Seen, Spec, Window
 from delayrl.core.views import network_input, view
@@ -34,10 +33,7 @@ SPEC = Spec(10, 2, 3)
 @functools.cache
 def parts():
     transitions, _ = record("Reacher-v5", 3, 90)
-    replay, append = ring.init(SPEC, 200), jax.jit(ring.append)
-    for transition in transitions:
-        replay = append(replay, transition)
-    windows = jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 32, 3, 3, 0)
+    windows = sample(replay_of(transitions, SPEC, 200), jax.random.key(0), 32, 3, 3, 0)
     return AGENT.init(SPEC, jax.random.key(0)), windows
 
 

@@ -14,7 +14,7 @@ from conftest import TINY, record
 from delayrl.agents.base import Agent
 from delayrl.agents.normalised import Moments, NormalisedObservations, merged
 from delayrl.core.types import Spec
-from short_runs import arrays, killed_and_resumed, train
+from short_runs import assert_same_networks, killed_and_resumed, train
 
 MOMENTS = Moments(jnp.float32(100), jnp.linspace(-3, 3, OBS), 100 * jnp.linspace(0.2, 4, OBS) ** 2)
 
@@ -93,8 +93,7 @@ def test_a_run_keeps_its_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     whole = train("bpql", tmp_path / "whole", observation_norm="running")
     cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, observation_norm="running")
     assert cut.rows() == whole.rows()
-    for name, array in arrays(cut).items():
-        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert_same_networks(cut, whole)
     policy = delayrl.load(whole.path)
     assert isinstance(policy.agent, NormalisedObservations)
     assert policy.state.moments.number == 201 * 8  # updates of the run, windows of a batch

@@ -11,10 +11,9 @@ import pytest
 from learners import ACT, OBS, random_windows, sampled, seen
 
 import delayrl
-from conftest import TINY, TINY_SAC, record
+from conftest import TINY, TINY_SAC, record, replay_of, sample
 from delayrl.agents.registry import AGENTS
 from delayrl.core import networks
-from delayrl.core import replay as ring
 from delayrl.core.protocol import CORRECTED
 from delayrl.core.types import Spec
 from delayrl.envs.making import make
@@ -195,11 +194,7 @@ def test_what_is_learned_from() -> None:
         (transitions, official("dcac").learnable(Spec(2, 1, DELAY)), lambda t: True),
         (transitions, official("vdpo").learnable(Spec(2, 1, DELAY)), lambda t: t.obs[0] <= t.obs[1] - 3),
     ):
-        replay = ring.init(Spec(2, 1, DELAY), 500)
-        append = jax.jit(ring.append, static_argnames="learnable")
-        for step in steps:
-            replay = append(replay, step, learnable)
-        sample = jax.jit(ring.sample, static_argnums=(2, 3, 4), static_argnames="learnable")
+        replay = replay_of(steps, Spec(2, 1, DELAY), 500, learnable)
         windows = sample(replay, jax.random.key(0), 5000, DELAY, 3, jnp.int32(0))
         drawn = set(np.asarray(windows.action[:, DELAY, 0]).tolist())
         expected = {action for action, t in first_action.items() if allowed(t)}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from learners import ACT, ENV, OBS, counted, random_windows, same, sampled, seen, trained
+from learners import ACT, ENV, OBS, assert_near, counted, random_windows, same, sampled, seen, trained
 
 from conftest import TINY, TINY_SAC, record
 from delayrl.agents.registry import AGENTS
@@ -132,11 +132,6 @@ def adams_first_step(old, gradient, rate: float):
     return jax.tree.map(lambda x, g: x - rate * g / (jnp.abs(g) + 1e-8), old, gradient)
 
 
-def near(a, b) -> None:
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
-
-
 @pytest.mark.parametrize("unit", ["task", "scaled"])
 def test_critic_target_by_hand(unit: str) -> None:
     """Y = Σ_{j<k} γ^j r_{t+j} + γ^k (1 - terminated) (min Q̄(s_{t+k}, a) - α log π(a|s_{t+k})), with each sample's k."""
@@ -159,8 +154,8 @@ def test_critic_target_by_hand(unit: str) -> None:
     error, gradient = jax.value_and_grad(loss)(state.critic)
     np.testing.assert_allclose(metrics["critic_loss"], error, rtol=1e-4)
     np.testing.assert_allclose(metrics["entropy"], -log_prob.mean(), rtol=1e-4)
-    near(new.critic, adams_first_step(state.critic, gradient, 2e-3))
-    near(new.target, optax.incremental_update(new.critic, state.target, 5e-3))
+    assert_near(new.critic, adams_first_step(state.critic, gradient, 2e-3))
+    assert_near(new.target, optax.incremental_update(new.critic, state.target, 5e-3))
 
 
 def test_actor_by_hand() -> None:
@@ -175,7 +170,7 @@ def test_actor_by_hand() -> None:
         return (3 * policy.mean**2).mean() - value.mean()
 
     new = agent.improve_actor(state, x, x, key, lambda actor, policy: (3 * policy.mean**2).mean())
-    near(new.actor, adams_first_step(state.actor, jax.grad(loss)(state.actor), 1e-3))
+    assert_near(new.actor, adams_first_step(state.actor, jax.grad(loss)(state.actor), 1e-3))
 
 
 @pytest.mark.parametrize("excess", [0.01, -0.01])

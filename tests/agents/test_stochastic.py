@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from learners import program_of
 
 import delayrl
-from conftest import TINY, learned, record
+from conftest import TINY, learned, record, replay_of
 from delayrl.cli import main as cli
 from delayrl.core import replay as ring
 from delayrl.core.protocol import OFFICIAL
@@ -27,7 +27,6 @@ from short_runs import killed_and_resumed, train
 from strategies import CHANNELS, EPISODES
 
 DELAYED = [name for name in TINY if name != "sac"]
-append = jax.jit(ring.append)
 STOCHASTIC, OF_EPISODES = "uniform:1:3@raw", "1+action=episode:choice:0=0.5,2=0.5"
 
 
@@ -46,9 +45,7 @@ def test_round_trip(channel: Channel, lag: DelayLaw, seed: int) -> None:
     delay = Delay(channel, Channel(lag)).observed()
     longest = delay.maximum
     transitions, shown = record("delayrl/Counter-v0", delay, 90, seed)
-    replay = ring.init(Spec(2, 1, longest), 200)
-    for transition in transitions:
-        replay = append(replay, transition)
+    replay = replay_of(transitions, Spec(2, 1, longest), 200)
     now, later, actions = jax.device_get(seen_in(replay, jax.random.key(seed), longest))
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     for i, action in enumerate(actions.tolist()):

@@ -36,10 +36,6 @@ seeds = pytest.mark.parametrize("seed", range(4))
 delays = pytest.mark.parametrize("delay", range(4))
 
 
-def generator(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
 def random_policy(rng: np.random.Generator, like: Array) -> Array:
     return rng.dirichlet(np.ones(like.shape[-1]), size=like.shape[0])
 
@@ -57,7 +53,7 @@ def best_distribution(objective: Callable[[Array], float], actions: int) -> Arra
 @delays
 def test_augmented_mdp_is_the_true_process_seen_late(seed: int, delay: int) -> None:
     """A delayed policy returns the same on the augmented MDP and on the process that generates the data."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     mdp = random_mdp(rng, states=3, actions=2)
     delayed, windows = augment(mdp, delay), window_process(mdp, delay)
     policy = random_policy(rng, delayed.mdp.reward)
@@ -68,7 +64,7 @@ def test_augmented_mdp_is_the_true_process_seen_late(seed: int, delay: int) -> N
 
 
 def test_optimal_policy_is_the_best_of_all_deterministic_ones() -> None:
-    mdp = augment(random_mdp(generator(0), states=2, actions=2), 1).mdp
+    mdp = augment(random_mdp(np.random.default_rng(0), states=2, actions=2), 1).mdp
     returns = [policy_return(mdp, np.eye(2)[list(choice)]) for choice in product(range(2), repeat=len(mdp.reward))]
     assert optimal_return(mdp) == pytest.approx(max(returns), abs=1e-12)
 
@@ -76,7 +72,7 @@ def test_optimal_policy_is_the_best_of_all_deterministic_ones() -> None:
 @seeds
 def test_soft_optimal_policy_is_greedy_for_its_own_value(seed: int) -> None:
     """At the optimum the soft value is that of an MDP whose reward includes the entropy of the policy."""
-    mdp, temperature = random_mdp(generator(seed)), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed)), 0.3
     q, policy = soft_optimal(mdp, temperature)
     entropy = -(policy * np.log(policy)).sum(axis=1, keepdims=True)
     value = evaluate(MDP(mdp.transition, mdp.reward + temperature * entropy, mdp.initial, mdp.discount), policy)
@@ -84,7 +80,7 @@ def test_soft_optimal_policy_is_greedy_for_its_own_value(seed: int) -> None:
 
 
 def test_occupancy_is_a_distribution() -> None:
-    mdp = random_mdp(generator(0))
+    mdp = random_mdp(np.random.default_rng(0))
     _, policy = soft_optimal(mdp, 0.3)
     share = occupancy(mdp, policy)
     assert share.sum() == pytest.approx(1)
@@ -98,7 +94,7 @@ def test_occupancy_is_a_distribution() -> None:
 @pytest.mark.parametrize("seed", range(8))
 def test_optimal_value_never_rises_with_delay(seed: int) -> None:
     """From every start state, not only on average."""
-    mdp = random_mdp(generator(seed))
+    mdp = random_mdp(np.random.default_rng(seed))
     values = np.stack([optimal_value(augment(mdp, delay).mdp)[:4] for delay in range(4)])
     assert (np.diff(values, axis=0) <= 1e-9).all()
     assert mdp.initial @ values[1] < mdp.initial @ values[0] - 1e-3
@@ -117,7 +113,7 @@ def test_optimal_return_falls_strictly_when_fresh_states_are_worth_having(delay:
 @seeds
 def test_stochastic_mdp_with_one_best_action_everywhere_loses_nothing(seed: int) -> None:
     """Stochastic transitions are not enough for a loss: the missing state must matter for the decision."""
-    mdp = random_mdp(generator(seed))
+    mdp = random_mdp(np.random.default_rng(seed))
     reward = mdp.reward.copy()
     reward[:, 0] = reward.max() + 1
     shared = MDP(np.repeat(mdp.transition[:, :1], 3, axis=1), reward, mdp.initial, mdp.discount)
@@ -128,7 +124,7 @@ def test_stochastic_mdp_with_one_best_action_everywhere_loses_nothing(seed: int)
 @seeds
 def test_loss_is_the_expected_regret_under_the_belief(seed: int) -> None:
     """J*_0 - J(π_Δ) = Σ_t γ^t E[V*(s_t) - Q*(s_t, a_t)] with s_t ~ b(· | x_t)."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     mdp = random_mdp(rng)
     value = optimal_value(mdp)
     regret = value[:, None] - (mdp.reward + mdp.discount * mdp.transition @ value)
@@ -143,7 +139,7 @@ def test_loss_is_the_expected_regret_under_the_belief(seed: int) -> None:
 @delays
 def test_deterministic_transitions_lose_nothing(seed: int, delay: int) -> None:
     """For any law of s_0: the first observation is s_0, so every history determines the current state."""
-    mdp = random_mdp(generator(seed), deterministic=True)
+    mdp = random_mdp(np.random.default_rng(seed), deterministic=True)
     delayed = augment(mdp, delay)
     assert set(np.unique(delayed.belief)) == {0.0, 1.0}
     np.testing.assert_allclose(optimal_value(delayed.mdp), delayed.belief @ optimal_value(mdp), atol=1e-9)
@@ -151,7 +147,7 @@ def test_deterministic_transitions_lose_nothing(seed: int, delay: int) -> None:
 
 def test_deterministic_transitions_lose_when_the_start_is_not_seen() -> None:
     """If nothing is seen before step Δ, a random s_0 costs even a deterministic MDP; a known s_0 does not."""
-    mdp, delay = random_mdp(generator(1), deterministic=True), 2
+    mdp, delay = random_mdp(np.random.default_rng(1), deterministic=True), 2
     known = MDP(mdp.transition, mdp.reward, np.eye(4)[0], mdp.discount)
     assert optimal_return(mdp) == pytest.approx(4.724, abs=1e-3)
     assert blind_start_return(mdp, delay) == pytest.approx(4.335, abs=1e-3)
@@ -194,7 +190,7 @@ def test_invented_first_actions_can_make_delay_pay() -> None:
 @delays
 def test_trajectory_kl_is_the_state_level_sum_with_constant_zero(seed: int, delay: int) -> None:
     """Under the joint law of (s_t, x_t) that π induces. The dynamics cancel, so no constant is left."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     mdp = random_mdp(rng, states=3, actions=2)
     policy = random_policy(rng, augment(mdp, delay).mdp.reward)
     found = trajectory_kl(mdp, delay, random_policy(rng, mdp.reward), policy)
@@ -206,7 +202,7 @@ def test_trajectory_kl_is_the_state_level_sum_with_constant_zero(seed: int, dela
 @seeds
 def test_other_readings_of_the_state_level_sum_fail(seed: int) -> None:
     """d^π(s_t) says nothing of x_t: s_t from b(· | x_t) is right for Δ ≤ 1 only, s_t drawn apart never."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     mdp = random_mdp(rng, states=3, actions=2)
     reference = random_policy(rng, mdp.reward)
     for delay in range(4):
@@ -224,7 +220,7 @@ def test_printed_constant_belongs_to_another_distribution(seed: int, determinist
 
     Its constant does not depend on π_Δ, as claimed, but is not zero; the KL of real trajectories has none.
     """
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     mdp = random_mdp(rng, states=3, actions=2, deterministic=deterministic)
     reference = random_policy(rng, mdp.reward)
     policies = [random_policy(rng, augment(mdp, 2).mdp.reward) for _ in range(3)]
@@ -260,7 +256,7 @@ def test_infinite_horizon_sum_diverges() -> None:
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_trajectory_kl_is_minimised_by_the_posterior_mixture(seed: int, delay: int) -> None:
     """Not by Eq. (7), the belief mixture, once Δ ≥ 2: π's past actions are evidence of the unseen states."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     mdp = random_mdp(rng, states=3, actions=2)
     reference = random_policy(rng, mdp.reward)
     delayed, windows = augment(mdp, delay), window_process(mdp, delay)
@@ -282,7 +278,7 @@ def test_trajectory_kl_is_minimised_by_the_posterior_mixture(seed: int, delay: i
 
 @seeds
 def test_forward_objective_is_minimised_by_the_mixture(seed: int) -> None:
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     belief, policy = rng.dirichlet(np.ones(4)), rng.dirichlet(np.ones(3), size=4)
     best = mixture(belief, policy)
     found = best_distribution(lambda q: float(belief @ kl(policy, q)), 3)
@@ -293,7 +289,7 @@ def test_forward_objective_is_minimised_by_the_mixture(seed: int) -> None:
 
 @seeds
 def test_reverse_objective_is_minimised_by_the_geometric_mean(seed: int) -> None:
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     belief, policy = rng.dirichlet(np.ones(4)), rng.dirichlet(np.ones(3), size=4)
     best = geometric_mean(belief, policy)
     found = best_distribution(lambda q: float(belief @ kl(q, policy)), 3)
@@ -314,7 +310,7 @@ def test_one_possible_state_can_veto_an_action_only_in_reverse() -> None:
 @seeds
 def test_critic_based_improvement_is_a_geometric_mean_for_any_critic(seed: int) -> None:
     """BPQL's and AD-SAC's step is exp(E_b[Q]/α); Q = α log softmax(Q/α) + V, and V has no action in it."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     belief, q, temperature = rng.dirichlet(np.ones(4), size=5), rng.normal(size=(4, 3)), 0.3
     improved = softmax(belief @ q / temperature)
     np.testing.assert_allclose(improved, geometric_mean(belief, softmax(q / temperature)), atol=1e-12)
@@ -324,7 +320,7 @@ def test_critic_based_improvement_is_a_geometric_mean_for_any_critic(seed: int) 
 @seeds
 def test_cold_limits(seed: int) -> None:
     """α → 0: the geometric mean maximises E_b[Q*]; the mixture draws an action as often as it is optimal."""
-    mdp, temperature = random_mdp(generator(seed)), 0.003
+    mdp, temperature = random_mdp(np.random.default_rng(seed)), 0.003
     belief = augment(mdp, 2).belief
     q, _ = soft_optimal(mdp, temperature)
     averaged = belief @ q

@@ -38,10 +38,6 @@ seeds = pytest.mark.parametrize("seed", range(4))
 two_seeds = pytest.mark.parametrize("seed", range(2))  # where fixed points take seconds
 
 
-def generator(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
 # ---- 5. Fixed points of the other methods (Lemma 3.7, Proposition 3.8) -------------------------------------
 
 
@@ -61,7 +57,7 @@ def test_dida_with_a_deterministic_student_takes_the_median_or_the_mean() -> Non
 @pytest.mark.parametrize("data", ["reference", "delayed", "lower_q"])
 def test_imitation_reaches_the_belief_mixture_only_on_its_own_data(seed: int, data: Data) -> None:
     """Forward KL with Δ = 2: DAgger's data gives Eq. (7), the reference's data the posterior mixture."""
-    mdp = random_mdp(generator(seed), states=3, actions=2)
+    mdp = random_mdp(np.random.default_rng(seed), states=3, actions=2)
     _, reference = soft_optimal(mdp, 0.3)
     delayed = augment(mdp, 2)
     found = imitation_fixed_point(mdp, 2, 0.3, data=data, forward=True)
@@ -99,7 +95,7 @@ def test_imitating_the_reference_on_its_own_data_latches() -> None:
 @seeds
 def test_bpql_has_a_fixed_point_of_its_own(seed: int) -> None:
     """Neither mean of the delay-free optimum, nor the mixture of what its own critic finds soft-greedy."""
-    mdp, temperature = random_mdp(generator(seed), states=3), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed), states=3), 0.3
     q, policy = bpql_fixed_point(mdp, 1, temperature)
     belief = augment(mdp, 1).belief
     free_q, reference = soft_optimal(mdp, temperature)
@@ -113,7 +109,7 @@ def test_bpql_has_a_fixed_point_of_its_own(seed: int) -> None:
 @pytest.mark.parametrize(("seed", "policy_gap", "value_gap"), [(0, 0.093, 2.249), (1, 0.183, 6.285), (2, 0.044, 0.605)])
 def test_ad_sac_is_not_vdpo(seed: int, policy_gap: float, value_gap: float) -> None:
     """Its critics hold the lower of two actors' values, so without auxiliary delay Q lies below Q* under noise."""
-    mdp, temperature = random_mdp(generator(seed)), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed)), 0.3
     belief = augment(mdp, 2).belief
     free_q, reference = soft_optimal(mdp, temperature)
     q, policy = adsac_fixed_point(mdp, 2, temperature)
@@ -125,7 +121,7 @@ def test_ad_sac_is_not_vdpo(seed: int, policy_gap: float, value_gap: float) -> N
 @two_seeds
 def test_ad_sac_is_a_more_cautious_bpql(seed: int) -> None:
     """The delayed actor's mean value is the lower one, which is BPQL's; the minimum of samples lies below both."""
-    mdp, temperature = random_mdp(generator(seed), states=3, actions=2), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed), states=3, actions=2), 0.3
     bpql, adsac = bpql_fixed_point(mdp, 2, temperature), adsac_fixed_point(mdp, 2, temperature)
     assert (adsac.q < bpql.q - 0.02).all()
     assert (bpql.q < soft_optimal(mdp, temperature)[0] - 0.02).all()
@@ -139,7 +135,7 @@ def test_ad_sac_is_a_more_cautious_bpql(seed: int) -> None:
 @pytest.mark.parametrize("younger", [0, 1, 2])
 def test_a_pull_by_kl_has_no_bias(seed: int, younger: int) -> None:
     """Towards the soft-greedy policy of any younger view, with any weight: what it asks for is BPQL's policy itself."""
-    mdp, temperature = random_mdp(generator(seed), states=3, actions=2), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed), states=3, actions=2), 0.3
     q, policy = bpql_fixed_point(mdp, 2, temperature)
     belief = augment(mdp, 2).belief
     shorter = softmax(augment(mdp, younger).belief @ q / temperature)
@@ -147,7 +143,7 @@ def test_a_pull_by_kl_has_no_bias(seed: int, younger: int) -> None:
     for weight in (0.1, 1.0, 10.0):
         found = pulled_by_kl(belief @ q, log_younger, temperature, weight)
         np.testing.assert_allclose(found, policy, atol=1e-9)
-        rng, objective = generator(7), any_age_objective(belief @ q, temperature, weight)
+        rng, objective = np.random.default_rng(7), any_age_objective(belief @ q, temperature, weight)
         for _ in range(20):  # and it is the minimum
             other = rng.dirichlet(np.ones(2), size=len(policy))
             own, others = (objective(p) - weight * (p * log_younger).sum(1) for p in (found, other))
@@ -162,7 +158,7 @@ def any_age_objective(averaged: np.ndarray, temperature: float, weight: float):
 @two_seeds
 def test_a_pull_by_squares_is_a_bias_until_it_is_gone(seed: int) -> None:
     """It asks for the mixture, more so with a larger weight; without a weight, or without noise, it is BPQL."""
-    mdp, temperature = random_mdp(generator(seed), states=3, actions=2), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed), states=3, actions=2), 0.3
     bpql = bpql_fixed_point(mdp, 2, temperature)
     gaps = []
     for weight in (0.0, 0.1, 1.0, 10.0):
@@ -174,7 +170,7 @@ def test_a_pull_by_squares_is_a_bias_until_it_is_gone(seed: int) -> None:
     assert gaps[-1] > 0.02
     kl_pull = any_age_fixed_point(mdp, 2, temperature, 10.0, "kl")
     np.testing.assert_allclose(kl_pull.policy, bpql.policy, atol=1e-8)
-    certain = random_mdp(generator(seed), states=3, actions=2, deterministic=True)
+    certain = random_mdp(np.random.default_rng(seed), states=3, actions=2, deterministic=True)
     free = bpql_fixed_point(certain, 2, temperature).policy
     np.testing.assert_allclose(any_age_fixed_point(certain, 2, temperature, 10.0, "squares").policy, free, atol=1e-6)
 
@@ -182,7 +178,7 @@ def test_a_pull_by_squares_is_a_bias_until_it_is_gone(seed: int) -> None:
 @seeds
 def test_the_pull_by_squares_is_at_its_minimum(seed: int) -> None:
     """No other distribution has a lower objective than what the formula with Wright's omega gives."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     averaged, mean = rng.normal(size=(50, 4)), rng.dirichlet(np.ones(4), size=50)
 
     def objective(p: np.ndarray) -> np.ndarray:
@@ -197,7 +193,7 @@ def test_the_pull_by_squares_is_at_its_minimum(seed: int) -> None:
 @seeds
 def test_the_minimum_of_samples_costs_a_positive_part(seed: int) -> None:
     """E min(V, Q - α log π) = E[Q - α log π] - α E[(log π_Q - log π)⁺], a ~ π, for any critic and policies."""
-    rng = generator(seed)
+    rng = np.random.default_rng(seed)
     q, policy, temperature = rng.normal(size=(5, 3)), rng.dirichlet(np.ones(3), size=5), 0.3
     late = q - temperature * np.log(policy)
     greedy = softmax(q / temperature)
@@ -211,7 +207,7 @@ def test_the_minimum_of_samples_costs_a_positive_part(seed: int) -> None:
 @seeds
 def test_ad_sac_with_the_full_auxiliary_delay_is_a_sac(seed: int) -> None:
     """Both actors are then one, and the minimum of equal values costs nothing."""
-    mdp, temperature = random_mdp(generator(seed)), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed)), 0.3
     q, policy = soft_optimal(augment(mdp, 2).mdp, temperature)
     found = adsac_fixed_point(mdp, 2, temperature, shorter=2)
     np.testing.assert_allclose(found.q, q, atol=1e-9)
@@ -221,7 +217,7 @@ def test_ad_sac_with_the_full_auxiliary_delay_is_a_sac(seed: int) -> None:
 @seeds
 def test_a_longer_auxiliary_delay_averages_over_shorter_histories(seed: int) -> None:
     """π_Δ is a geometric mean over x^τ given x, of policies that are soft-greedy for AD-SAC's critic."""
-    mdp, temperature = random_mdp(generator(seed), states=3, actions=2), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed), states=3, actions=2), 0.3
     q, policy = adsac_fixed_point(mdp, 2, temperature, shorter=1)
     law = shorter_histories(mdp, 2, 1)
     np.testing.assert_allclose(policy, geometric_mean(law, softmax(q / temperature)), atol=1e-9)
@@ -233,7 +229,7 @@ def test_a_longer_auxiliary_delay_averages_over_shorter_histories(seed: int) -> 
 @pytest.mark.parametrize("delay", [1, 2])
 def test_all_fixed_points_agree_without_noise(seed: int, delay: int) -> None:
     """Deterministic transitions: every belief is a point, where every method has the reference's policy."""
-    mdp, temperature = random_mdp(generator(seed), states=3, actions=2, deterministic=True), 0.3
+    mdp, temperature = random_mdp(np.random.default_rng(seed), states=3, actions=2, deterministic=True), 0.3
     delayed = augment(mdp, delay)
     _, reference = soft_optimal(mdp, temperature)
     expected = delayed.belief @ reference
@@ -277,7 +273,7 @@ def test_either_mean_can_be_the_better_one(wrong_cost: float, mixture_wins: bool
 @pytest.mark.parametrize("seed", range(10))
 def test_geometric_mean_wins_on_random_mdps(seed: int) -> None:
     """And no delayed policy beats the best delayed policy."""
-    mdp, temperature = random_mdp(generator(seed)), 0.1
+    mdp, temperature = random_mdp(np.random.default_rng(seed)), 0.1
     delayed = augment(mdp, 2)
     _, reference = soft_optimal(mdp, temperature)
     by_mixture = policy_return(delayed.mdp, mixture(delayed.belief, reference))

@@ -5,11 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid
-from short_runs import newest
+from short_runs import assert_same_networks
 
 SAC = """
 preset = "small"
@@ -63,9 +61,7 @@ def assert_same_results(file: Path, runs: Path, expected: Path) -> None:
             rows = [json.loads(line) for line in text.splitlines()]
             episodes = [(row["step"], row["policy"], row["episode"]) for row in rows]
             assert len(set(episodes)) == len(episodes) == cell.condition.steps // 30
-            ours, others = (newest(run).arrays("agent") for run in (mine, theirs))
-            for name, array in ours.items():
-                np.testing.assert_array_equal(array, others[name])
+            assert_same_networks(mine, theirs)
 
 
 def worker_of(folder: Path) -> int | None:

@@ -1,19 +1,14 @@
 """The table of any-age beside other agents."""
 
-import sys
-from pathlib import Path
 from typing import Any
 
+import against
 import numpy as np
 import pytest
+from ladder import paired
+from synthetic import row, standing
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
-
-import against  # noqa: E402
-from ladder import paired  # noqa: E402
-from synthetic import row, standing  # noqa: E402
-
-from delayrl.report.summary import summarise  # noqa: E402
+from delayrl.report.summary import summarise
 
 
 def cell(agent: str, finals: list[float], delay: int | str, **changes: Any) -> Any:

@@ -1,23 +1,18 @@
 """The ladder's arm with CrossQ's critics: against batch norm written out, and trained by its name."""
 
-import sys
 from pathlib import Path
 
+import crossq
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks")]
-
-import crossq  # noqa: E402
-
-import delayrl  # noqa: E402
-from conftest import record  # noqa: E402
-from delayrl.core import networks  # noqa: E402
-from delayrl.core import replay as ring  # noqa: E402
-from delayrl.core.types import Spec, Window  # noqa: E402
+import delayrl
+from conftest import record, replay_of, sample
+from delayrl.core import networks
+from delayrl.core.types import Spec, Window
 
 SPEC = Spec(10, 2, 3)
 AGENT = crossq.CrossQ(
@@ -29,10 +24,7 @@ update = jax.jit(AGENT.update)
 @pytest.fixture(scope="module")
 def windows() -> Window:
     transitions, _ = record("Reacher-v5", 3, 120)
-    replay = ring.init(SPEC, 200)
-    for transition in transitions:
-        replay = jax.jit(ring.append)(replay, transition)
-    return jax.jit(ring.sample, static_argnums=(2, 3, 4))(replay, jax.random.key(0), 16, 3, 3, jnp.int32(0))
+    return sample(replay_of(transitions, SPEC, 200), jax.random.key(0), 16, 3, 3, jnp.int32(0))
 
 
 def written_out(critic: dict, x: np.ndarray) -> np.ndarray:

@@ -1,18 +1,15 @@
 """The generated sections of the pages are what `benchmarks/figures.py` writes from the committed rows."""
 
 import json
-import sys
 from pathlib import Path
 
+import figures
+import ppo
 import pytest
 
+from delayrl.cli.main import main as delayrl
+
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import figures  # noqa: E402
-import ppo  # noqa: E402
-
-from delayrl.cli.main import main as delayrl  # noqa: E402
 
 
 def section(page: str, key: str) -> str:

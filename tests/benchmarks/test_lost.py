@@ -1,18 +1,14 @@
 """The table that says how many episodes are lost."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
+import lost
 import pytest
+from synthetic import Standing, standing
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
-
-import lost  # noqa: E402
-from synthetic import Standing, standing  # noqa: E402
-
-from delayrl.bench.results import Collected  # noqa: E402
-from delayrl.errors import DelayRLError  # noqa: E402
+from delayrl.bench.results import Collected
+from delayrl.errors import DelayRLError
 
 ENV, HALF, END = "HalfCheetah-v5", 75_000, 100_000
 HIGH, LOW = {HALF: [9000.0, 1000.0], END: [9000.0, 9000.0]}, {HALF: [50.0, 50.0], END: [50.0, 50.0]}

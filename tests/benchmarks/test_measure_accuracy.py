@@ -1,14 +1,10 @@
 """The benchmark of `delayrl measure` measures logs that it makes."""
 
-import sys
 from pathlib import Path
 
+import measure_accuracy
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-import measure_accuracy
 
 
 @pytest.mark.parametrize("delay", [0, 4])

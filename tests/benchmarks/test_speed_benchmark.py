@@ -5,24 +5,21 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import floor
 import jax
 import jax.numpy as jnp
+import operations
 import pytest
+import worker
+from speed import tables
+from works import SIZES, WORKS, Work
+
+import run
+from delayrl.agents.sac import SAC
+from delayrl.core import replay as ring
+from delayrl.core.types import Spec
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path[:0] = [str(BENCHMARKS), str(BENCHMARKS / "speed")]
-
-import floor  # noqa: E402
-import operations  # noqa: E402
-import worker  # noqa: E402
-from speed import tables  # noqa: E402
-from works import SIZES, WORKS, Work  # noqa: E402
-
-import run  # noqa: E402
-from delayrl.agents.sac import SAC  # noqa: E402
-from delayrl.core import replay as ring  # noqa: E402
-from delayrl.core.types import Spec  # noqa: E402
-
 DUMMY = {"kind": "dummy", "env": "InvertedPendulum-v5", "delay": 0, "seeds": 1, "device": "cpu", "options": {}}
 
 

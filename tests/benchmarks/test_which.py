@@ -1,19 +1,15 @@
 """The table that says which agent is best where."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+import which
+from synthetic import Standing, curve, standing
 
-sys.path[:0] = [str(Path(__file__).parents[2] / "benchmarks"), str(Path(__file__).parents[1] / "report")]
-
-import which  # noqa: E402
-from synthetic import Standing, curve, standing  # noqa: E402
-
-from delayrl.errors import DelayRLError  # noqa: E402
-from delayrl.report.results import Result  # noqa: E402
-from delayrl.report.summary import summarise  # noqa: E402
+from delayrl.errors import DelayRLError
+from delayrl.report.results import Result
+from delayrl.report.summary import summarise
 
 HIGH, LOW, CLOSE = [10.0, 11, 12, 13, 14], [0.0, 1, 2, 3, 4], [9.0, 11, 12, 13, 14]
 Cells = list[tuple[Standing, list[float]]]

@@ -201,13 +201,6 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"delayrl {delayrl.__version__}\n"
 
 
-def test_help_needs_no_jax() -> None:
-    program = (
-        "import sys; from delayrl.cli.main import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_of_a_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:

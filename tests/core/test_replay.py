@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conftest import record
+from conftest import append, record, replay_of, sample
 from delayrl.core import replay as ring
 from delayrl.core.types import Spec
 from delayrl.core.views import view
@@ -17,17 +17,11 @@ TASK = "delayrl/Counter-v0"  # observation [t, T], reward t + 1, ends after T st
 
 def filled(steps: int, delay: int, capacity: int) -> tuple[ring.Replay, list, list]:
     transitions, shown = record(TASK, delay, steps)
-    replay = ring.init(Spec(2, 1, delay), capacity)
-    append = jax.jit(ring.append)
-    for transition in transitions:
-        replay = append(replay, transition)
-    return replay, transitions, shown
+    return replay_of(transitions, Spec(2, 1, delay), capacity), transitions, shown
 
 
 def draw(replay: ring.Replay, batch: int, delay: int, ahead: int, hidden: int = 0):
-    return jax.jit(ring.sample, static_argnums=(2, 3, 4))(
-        replay, jax.random.key(1), batch, delay, ahead, jnp.int32(hidden)
-    )
+    return sample(replay, jax.random.key(1), batch, delay, ahead, jnp.int32(hidden))
 
 
 @pytest.mark.parametrize(("delay", "ahead", "capacity"), [(3, 3, 500), (3, 3, 60), (7, 5, 90), (1, 1, 40), (0, 3, 50)])
@@ -75,9 +69,7 @@ def test_every_start_is_drawn_equally() -> None:
 def test_official_starts() -> None:
     """With `whole` = 3 the last two starts of an episode are never drawn, and all others are."""
     transitions, _ = record(TASK, 2, 120)
-    replay = ring.init(Spec(2, 1, 2), 500)
-    for transition in transitions:
-        replay = jax.jit(ring.append, static_argnames="learnable")(replay, transition, ring.Learnable(until_end=3))
+    replay = replay_of(transitions, Spec(2, 1, 2), 500, ring.Learnable(until_end=3))
     windows = draw(replay, 20_000, 2, 3)
     assert int(windows.lead.min()) == 3
     complete = [t for t in transitions if t.obs[0] <= t.obs[1] - 3]
@@ -91,7 +83,6 @@ def test_windows_are_whole_when_the_ring_closes() -> None:
     """Steps that start Δ rows into their episode: the rows before them are overwritten before any step is."""
     delay, capacity = 4, 40
     transitions, _ = record(TASK, delay, 60)
-    append = jax.jit(ring.append, static_argnames="learnable")
     replay, whole = ring.init(Spec(2, 1, delay), capacity), 0
     for transition in transitions:
         replay = append(replay, transition, ring.Learnable(first=delay))
@@ -152,11 +143,9 @@ def test_hidden_observations_are_never_given(hidden: int) -> None:
     transitions, _ = record(TASK, delay, 200)
     while transitions[-1].next_obs[0] < 3 or transitions[-1].done:
         transitions.pop()
-    replay = ring.init(Spec(2, 1, delay), 400)
-    for i, transition in enumerate(transitions):
-        mark = np.float32([i, 0])  # observations named by the step that follows them
-        step = transition._replace(obs=mark, next_obs=np.float32([i + 1, 0]))
-        replay = jax.jit(ring.append)(replay, step)
+    marks = np.float32([[i, 0] for i in range(len(transitions) + 1)])  # observations named by the step that follows
+    marked = [t._replace(obs=marks[i], next_obs=marks[i + 1]) for i, t in enumerate(transitions)]
+    replay = replay_of(marked, Spec(2, 1, delay), 400)
     windows = draw(replay, 5000, delay, 3, hidden)
     newest = len(transitions) - hidden
     assert int(windows.obs[..., 0].max()) == newest
@@ -170,12 +159,10 @@ def test_of_finished_episodes_nothing_is_hidden() -> None:
     transitions, _ = record(TASK, delay, 120)
     while transitions[-1].done or transitions[-1].next_obs[0] != 4:  # one step of the current episode counts
         transitions.pop()
-    replay = ring.init(Spec(2, 1, delay), 400)
-    for transition in transitions:
-        replay = jax.jit(ring.append, static_argnames="learnable")(replay, transition, learnable)
+    replay = replay_of(transitions, Spec(2, 1, delay), 400, learnable)
     counts = [int(ring.drawable(replay, hidden, learnable)) for hidden in (0, 1, 3)]
     assert counts == [int(replay.steps), int(replay.steps) - 1, int(replay.steps) - 1]
-    windows = ring.sample(replay, jax.random.key(0), 5000, delay, 1, jnp.int32(3), learnable=learnable)
+    windows = sample(replay, jax.random.key(0), 5000, delay, 1, jnp.int32(3), learnable)
     drawn = set(np.asarray(windows.action[:, delay, 0]).tolist())
     start = len(transitions) - 4
     assert drawn == {float(t.action[0]) for t in transitions[:start] if t.obs[0] >= 3}

@@ -282,3 +282,6 @@ def test_the_example_with_delayed_commands(tmp_path: Path, monkeypatch: pytest.M
     words = ["--delay", "1+action=2", "--out", str(tmp_path / "bundle")]
     monkeypatch.setattr(sys, "argv", [str(example), *words])
     runpy.run_path(str(example), run_name="__main__")
+    bundle = load_bundle(tmp_path / "bundle")
+    assert [bundle.metadata[name] for name in ("agent", "env", "delay")] == ["SAC", "Pendulum-v1", "1+action=2"]
+    assert (bundle.min_age, bundle.max_age, bundle.action_delay) == (3, 3, 2)

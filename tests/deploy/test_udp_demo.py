@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import wire
+from demo import ROUGH, Scenario, play
 from hypothesis import example, given
 from hypothesis import strategies as st
+from link import Link, Travelling
 
 DEMO = Path(__file__).parents[2] / "examples" / "udp_demo"
-sys.path.insert(0, str(DEMO))
-
-import wire  # noqa: E402
-from demo import ROUGH, Scenario, play  # noqa: E402
-from link import Link, Travelling  # noqa: E402
 
 
 def run(controller: str, link: Link, steps: int, real_time: bool = False) -> tuple[list[dict], dict]:

@@ -34,10 +34,6 @@ def test_gymnasium_makes_our_tasks(code: str) -> None:
     python(code + "assert not [f for f in sys.meta_path if type(f).__module__ == 'delayrl.envs.registration']")
 
 
-def test_importing_delayrl_imports_nothing_else() -> None:
-    python("import sys, delayrl\nassert not {'gymnasium', 'numpy', 'jax'} & set(sys.modules)")
-
-
 def test_what_another_package_imports_is_found_as_before() -> None:
     """Whoever watches imports must not break those that fail."""
     code = "import sys, delayrl\nsys.modules['gymnasium'] = None\n"

@@ -315,13 +315,6 @@ def test_a_far_bound_moves_no_push(low: float, high: float) -> None:
     assert 0 < env.most <= 1
 
 
-def test_needs_only_numpy_and_gymnasium() -> None:
-    heavy = {"jax", "matplotlib", "mujoco", "pyarrow"}
-    code = f"import sys, delayrl.measure; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
-
-
 def test_environments_that_cannot_be_probed() -> None:
     with pytest.raises(DelayRLError, match=r"does not repeat itself.*np_random"):
         probe(Hidden(noise=True))

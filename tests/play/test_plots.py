@@ -1,6 +1,5 @@
 """Pictures of runs: their names are text, not formulas."""
 
-import errno
 import json
 import os
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from delayrl.errors import DelayRLError
 from delayrl.play import plots
 from delayrl.play.run import Run
+from short_runs import full_disk
 
 
 def test_names_with_two_dollar_signs(tmp_path: Path) -> None:
@@ -30,12 +30,9 @@ def test_names_with_two_dollar_signs(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_keeps_the_picture_that_was_there(tmp_path: Path, monkeypatch) -> None:
-    def full(handle: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     picture = tmp_path / "delays.png"
     picture.write_bytes(b"older")
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full_disk)
     row = {"agent": "sac", "env": "E", "seed": 0, "policy": "agent", "step": 1, "delay": 1, "returns": [1.0]}
     with pytest.raises(DelayRLError, match=r"cannot write to .*delays.png: the disk is full"):
         plots.against_delay([row | {"episodes": 1}], picture)

@@ -1,6 +1,5 @@
 """Run folders and their checkpoints: what is good stays, what is broken is named in one line."""
 
-import errno
 import json
 import os
 import re
@@ -14,6 +13,7 @@ from delayrl.errors import DelayRLError
 from delayrl.run.checkpoint import checkpoint_folders
 from delayrl.run.disk import lock
 from delayrl.run.folder import RunFolder
+from short_runs import full_disk
 
 WEIGHTS = {"w": np.ones(3, np.float32)}
 LOOP = {"rows": np.int32(1)}
@@ -33,11 +33,7 @@ def test_a_checkpoint_of_the_same_step_is_replaced_only_when_complete(run: RunFo
     """A run that is stopped right after an evaluation saves its step twice."""
     run.save(100, {"w": np.zeros(3, np.float32)}, LOOP, {})
     assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]
-
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(DelayRLError, match="the disk is full; what was stored before is kept"):
         run.save(100, WEIGHTS, LOOP, {})
     assert run.latest().arrays("agent")["w"].tolist() == [0, 0, 0]

@@ -25,7 +25,7 @@ from delayrl.run.arrays import Arrays, flatten_tree
 from delayrl.run.folder import versions_in
 from delayrl.training.origin import RENAMED, _renamed, fitting, parts_of, taken_over
 from random_states import random_state
-from short_runs import SHRINK, arrays, newest, train
+from short_runs import SHRINK, arrays, assert_same_networks, newest, train
 
 module = import_module("delayrl.training.train")  # `delayrl.training` may show its function under that name
 
@@ -43,8 +43,7 @@ def test_a_run_that_goes_on_is_the_longer_run(agent: str, tmp_path: Path) -> Non
     for steps in (300, 400):
         assert delayrl.go_on(run.path, steps, progress=False) == run
     assert without_hash(run) == without_hash(whole)
-    for name, array in arrays(run).items():
-        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert_same_networks(run, whole)
     assert run.config["origin"] == {"lengths": [200, 300]}
     assert run.config["cost"] == whole.config["cost"]
     assert {row["configuration"] for row in run.rows()} == {run.config["configuration"]}

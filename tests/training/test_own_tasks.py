@@ -25,7 +25,7 @@ from delayrl.play.evaluation import evaluate
 from delayrl.run.condition import resolve
 from delayrl.run.folder import RunFolder
 from own_tasks import LIMIT, Arm, Camera, make_arm, write_module
-from short_runs import SHRINK, arrays, killed_and_resumed, train
+from short_runs import SHRINK, assert_same_networks, killed_and_resumed, train
 
 LENGTH = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
 LENGTH += ["--replay-capacity", "250", "--quiet"]
@@ -132,8 +132,7 @@ def test_a_function_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -
     run = killed_and_resumed(SHRINK, tmp_path / "partial", monkeypatch, env=maker, env_kwargs={"gain": 0.5})
     named = train(SHRINK, tmp_path / "named", env="own_tasks:make_arm(gain=0.5)")
     assert (run.config["env"], named.config["env"]) == ("<partial>(gain=0.5)", "own_tasks:make_arm(gain=0.5)")
-    for name, array in arrays(named).items():
-        np.testing.assert_array_equal(array, arrays(run)[name])
+    assert_same_networks(named, run)
     for call in (lambda: delayrl.load(run.path), lambda: evaluate(run.path)):
         with pytest.raises(DelayRLError, match="<partial> has no name"):
             call()

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import killing
@@ -17,9 +18,8 @@ from conftest import quick
 from delayrl.agents.registry import AGENTS
 from delayrl.play.run import Run
 from delayrl.run.folder import RunFolder
-from delayrl.training.actor import Actor
 from delayrl.training.signals import stop_signal
-from short_runs import arrays, newest, train
+from short_runs import assert_same_networks, at_step, newest, train
 
 KILLED = ("bpql", "vdpo")
 
@@ -43,11 +43,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory):
 def assert_same(agent: str, out: Path, whole: list[Run]) -> None:
     for run, expected in zip(delayrl.train(agent, out=out, **options(agent)), whole, strict=True):
         assert run.rows() == expected.rows()
-        mine, theirs = (newest(r).arrays("agent") for r in (run, expected))
-        assert mine.keys() == theirs.keys()
-        for name, array in mine.items():
-            np.testing.assert_array_equal(array, theirs[name])
+        assert_same_networks(run, expected)
         assert sorted(p.name for p in run.path.iterdir()) == sorted(p.name for p in expected.path.iterdir())
+
+
+def killed() -> None:
+    raise KilledError
 
 
 def die(agent: str, out: Path, now: Callable[[int, str, str], bool]) -> bool:
@@ -126,23 +127,11 @@ ALIKE = ("bpql", "sac", "sac-memoryless", "a-sac", "any-age", "lifting", "ad-sac
         *(pytest.param(*param.values, 237, {}, marks=param.marks) for param in quick(AGENTS, *KEPT, slow=ALIKE)),
     ],
 )
-def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict, tmp_path: Path, monkeypatch) -> None:
+def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict, tmp_path: Path) -> None:
     """Bit for bit: rows and parameters, with a replay that has gone round, and an episode cut in its middle."""
     whole = train(agent, tmp_path / "whole", **options)
-    step = Actor.step
-    calls = 0
-
-    def dying(self, action):
-        nonlocal calls
-        calls += 1
-        if calls == at:
-            raise KilledError
-        return step(self, action)
-
-    monkeypatch.setattr(Actor, "step", dying)
-    with pytest.raises(KilledError):
+    with at_step(at, killed), pytest.raises(KilledError):
         train(agent, tmp_path / "cut", **options, slim=True)
-    monkeypatch.setattr(Actor, "step", step)
     run = RunFolder(tmp_path / "cut")
     assert run.latest().step == at // 100 * 100
     # made after the checkpoint
@@ -151,8 +140,7 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict,
         file.write('{"step": 299, "pol')
     resumed = train(agent, tmp_path / "cut", **options, slim=True)
     assert resumed.rows() == whole.rows()
-    for name, array in arrays(resumed).items():
-        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert_same_networks(resumed, whole)
     assert not (run.path / "replay").exists()
     assert len(list((whole.path / "checkpoints").iterdir())) == 1
 
@@ -165,27 +153,17 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict,
         pytest.param("vdpo", 10, marks=pytest.mark.slow),
     ],
 )
-def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_path: Path, monkeypatch) -> None:
+def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_path: Path) -> None:
     """A run that is asked to stop keeps its newest steps and goes on with them, bit for bit."""
     values = {"updates_per_call": block}
     whole = train(agent, tmp_path / "whole", **values)
-    step, calls = Actor.step, 0
-
-    def interrupted(self, action):
-        nonlocal calls
-        calls += 1
-        if calls == 157:
-            signal.raise_signal(signal.SIGINT)
-        return step(self, action)
-
-    monkeypatch.setattr(Actor, "step", interrupted)
-    with pytest.raises(delayrl.DelayRLError, match="stopped at step 157"):
+    interrupt = partial(signal.raise_signal, signal.SIGINT)
+    with at_step(157, interrupt), pytest.raises(delayrl.DelayRLError, match="stopped at step 157"):
         train(agent, tmp_path / "cut", **values)
     assert len(newest(tmp_path / "cut").arrays("loop")["pending.obs"]) == (157 - 1) % block + 1
     resumed = train(agent, tmp_path / "cut", **values)
     assert resumed.rows() == whole.rows()
-    for name, array in arrays(resumed).items():
-        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert_same_networks(resumed, whole)
 
 
 def test_a_second_interrupt_does_not_wait_for_the_loop() -> None:
@@ -204,21 +182,10 @@ def test_a_second_interrupt_does_not_wait_for_the_loop() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_broken_checkpoint_falls_back(tmp_path: Path, monkeypatch) -> None:
+def test_broken_checkpoint_falls_back(tmp_path: Path) -> None:
     """A cut file is named, and the checkpoint before it is used; with none left the run says so."""
-    step, calls = Actor.step, 0
-
-    def dying(self, action):
-        nonlocal calls
-        calls += 1
-        if calls == 250:
-            raise KilledError
-        return step(self, action)
-
-    monkeypatch.setattr(Actor, "step", dying)
-    with pytest.raises(KilledError):
+    with at_step(250, killed), pytest.raises(KilledError):
         train("bpql", tmp_path / "run")
-    monkeypatch.setattr(Actor, "step", step)
     run = RunFolder(tmp_path / "run")
     last = run.latest().path / "agent.safetensors"
     last.write_bytes(last.read_bytes()[:-100])

@@ -13,7 +13,7 @@ from delayrl.cli.main import main
 from delayrl.play.evaluation import RANDOM_ACTIONS, TRAINING, reset_seed
 from delayrl.play.policy import Policy
 from delayrl.play.run import Run
-from short_runs import arrays, killed_and_resumed, newest, train
+from short_runs import assert_same_networks, killed_and_resumed, newest, train
 
 
 def test_curves_are_those_of_the_rows(vdpo: Run) -> None:
@@ -121,8 +121,7 @@ def test_a_callback_sees_each_evaluation_and_may_stop(tmp_path: Path) -> None:
     assert (run.path / "curve.png").exists()
     whole = train("bpql", tmp_path / "whole")
     assert train("bpql", tmp_path / "run").rows() == whole.rows()
-    for name, array in arrays(run).items():
-        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert_same_networks(run, whole)
 
 
 def test_runs_of_a_folder(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from delayrl.training.checks import check_fit
 from delayrl.training.learner import Program
 from delayrl.training.seeds import seed_numbers
 from own_tasks import failing
-from short_runs import arrays, newest, train
+from short_runs import arrays, assert_same_networks, newest, train
 
 
 def test_rows(vdpo: Run) -> None:
@@ -44,8 +44,7 @@ def test_rows(vdpo: Run) -> None:
 def test_same_seed_same_run(vdpo: Run, tmp_path: Path) -> None:
     again = train("vdpo", tmp_path / "again")
     assert again.rows() == vdpo.rows()
-    for name, array in arrays(again).items():
-        np.testing.assert_array_equal(array, arrays(vdpo)[name])
+    assert_same_networks(again, vdpo)
     other = train("vdpo", tmp_path / "other", seed=1)
     assert other.rows()[0]["return"] != vdpo.rows()[0]["return"]
 
@@ -57,8 +56,7 @@ def test_threads_change_nothing(agent: str, tmp_path: Path) -> None:
     beside = train(agent, tmp_path / "beside", seeds=2, threads=3)
     for one, other in zip(alone, beside, strict=True):
         assert one.rows() == other.rows()
-        for name, array in arrays(one).items():
-            np.testing.assert_array_equal(array, arrays(other)[name])
+        assert_same_networks(one, other)
     with pytest.raises(delayrl.DelayRLError, match="threads must be a whole number, at least 1; got 0"):
         train("bpql", tmp_path / "run", threads=0)
     with pytest.raises(delayrl.DelayRLError, match="threads must be a whole number, at least 1; got '2'"):

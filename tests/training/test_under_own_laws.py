@@ -19,7 +19,7 @@ from delayrl.lookup import contents
 from delayrl.play.evaluation import evaluate, sweep
 from delayrl.run.condition import resolve
 from own_laws import Burst
-from short_runs import SHRINK, arrays, killed_and_resumed, train
+from short_runs import SHRINK, assert_same_networks, killed_and_resumed, train
 
 BURST = "own_laws:Burst(length=2, rate=0.3, steps=3)"
 
@@ -52,8 +52,7 @@ def test_a_law_without_a_name_is_given_again(tmp_path: Path, monkeypatch) -> Non
     run: Any = killed_and_resumed(SHRINK, tmp_path / "local", monkeypatch, delay=Local(0.3))
     named = train(SHRINK, tmp_path / "named", delay=Burst(0.3))
     assert run.config["delay"] == "<Local:3>"
-    for name, array in arrays(named).items():
-        np.testing.assert_array_equal(array, arrays(run)[name])
+    assert_same_networks(named, run)
     assert delayrl.load(run.path).spec == delayrl.load(named.path).spec
     with pytest.raises(DelayRLError, match="<Local:3> has no name that it could be imported by: give it again, as del"):
         evaluate(run.path, 1)

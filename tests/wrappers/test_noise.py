@@ -12,7 +12,7 @@ from delayrl.core.protocol import Protocol
 from delayrl.envs.probe import Walk
 from delayrl.training.actor import Actor
 from delayrl.wrappers import Delayed, NoisyActions
-from short_runs import arrays, killed_and_resumed, train
+from short_runs import assert_same_networks, killed_and_resumed, train
 
 gym.register(
     "delayrl/NoisyWalk-v0",
@@ -138,8 +138,7 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     whole = train("bpql", tmp_path / "whole", **options)
     cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, **options)
     assert cut.rows() == whole.rows()
-    for name, array in arrays(cut).items():
-        np.testing.assert_array_equal(array, arrays(whole)[name])
+    assert_same_networks(cut, whole)
 
 
 def test_the_papers_noisy_tasks() -> None:

@@ -1,0 +1,67 @@
+"""The ladder's tables, from results whose answer is known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import ladder
+import pytest
+from finished import result
+from scipy import stats
+
+import delayrl
+from delayrl.report.results import NO_ANCHOR
+from delayrl.run.cell import Cell
+from delayrl.run.condition import Condition
+
+
+def test_the_ladder_pairs_seeds_by_place() -> None:
+    """An arm whose first seeds have not ended would be paired with others."""
+    cells = [
+        Cell(Condition("bpql", "X-v0", 25, preset="matched"), seeds, str(seeds)) for seeds in ((0, 1), (2, 3), (3,))
+    ]
+    ladder.check_seeds(cells[:2])
+    with pytest.raises(delayrl.DelayRLError, match=r"`bpql` has ended for seeds \[0, 1, 3\]"):
+        ladder.check_seeds([cells[0], cells[2]])
+
+
+def test_the_ladder_compares_with_bpql() -> None:
+    """The mean of an arm's curves over that of BPQL's, and how many seeds got away."""
+    base = result("bpql", 25, [[1000.0, 1000.0], [1200.0, 1200.0]])
+    arm = result("any-age", 25, [[2000.0, 2000.0], [2400.0, 1400.0]], pull_weight=0.0)
+    lines = ladder.table([arm, base], {"`any-age`, `pull_weight=0.0`": 1.5}).splitlines()[2:]
+    cells = [line.strip("| ").split(" | ") for line in lines]
+    assert cells[0][:2] == ["`any-age`, `pull_weight=0.0`", "2"]
+    own = ladder.area(arm).mean()
+    assert float(cells[0][3]) == pytest.approx((own + 100) / 1200, abs=0.01)  # above the random policy's -100
+    assert cells[0][4].startswith(f"+{own - 1100:,.0f} (")
+    assert cells[0][7:] == ["1 of 2", "1.23", "1.50"]
+    assert cells[1][3:5] == ["", ""]
+    assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
+    whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
+    line = ladder.table([whole, arm, base]).splitlines()[3].strip("| ").split(" | ")
+    assert line[5] == "+300 (-2,241 to +2,841)"  # gaps of 500 and 100, t = 12.706; the third seed has no other
+    smaller = result("any-age", 25, [[2000.0, 2000.0], [2000.0, 1000.0]], batch_size=128)
+    changed = result("any-age", 25, [[1000.0, 1000.0], [1000.0, 1000.0]], batch_size=128, n_steps=5)
+    lines = [line.strip("| ").split(" | ") for line in ladder.table([whole, smaller, changed]).splitlines()[2:]]
+    assert [line[5].split(" ")[0] for line in lines] == ["", "+500", "+750"]  # each with any-age that has its batches
+
+
+def test_update_times_are_paired_by_round(tmp_path: Path) -> None:
+    """The median of the rounds' ratios; a round that met other work met it on both sides."""
+    rows = [{"versions": {}}, {"arm": "`any-age`", "ms": [2.0, 4.0, 90.0]}, {"arm": "`bpql`", "ms": [1.0, 2.0, 30.0]}]
+    (tmp_path / "arms.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert ladder.update_times(tmp_path / "arms.jsonl") == {"`any-age`": 2.0, "`bpql`": 1.0}
+    assert ladder.update_times(tmp_path / "none.jsonl") == {}
+
+
+def test_the_goals_of_the_ladder() -> None:
+    """Ratios above the random policy, and Welch's interval of the difference of raw returns."""
+    base = result("bpql", 25, [[1000.0, 1000.0], [1200.0, 1200.0]])
+    whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
+    (line,) = [line.strip("| ").split(" | ") for line in ladder.goals([whole, base]).splitlines()[2:]]
+    assert line[:4] == ["`any-age`", "`bpql`", "", f"{(4500 + 100) / 1200:.2f}"]
+    welch = stats.ttest_ind([2500.0, 1500, 9000], [1000.0, 1200], equal_var=False).confidence_interval()
+    bare = replace(base, reference_anchor=NO_ANCHOR)  # the released settings are of a preset without delay-free SAC
+    assert ladder.goals([whole, bare]) == ladder.goals([whole, base])
+    assert line[6] == f"+{13000 / 3 - 1100:,.0f} ({welch.low:+,.0f} to {welch.high:+,.0f})"
