@@ -181,7 +181,9 @@ def relative_costs(env: str, delays: tuple[int, ...]) -> str:
         pairs = zip(own, known["`bpql`"], strict=True)
         body.append([f"{label}{mark}", *(f"{cost.flops / base.flops:.1f}" for (_, cost), (_, base) in pairs)])
     table = markdown_table(["agent", *(f"Δ = {delay}" for delay in delays)], body)
-    rest = "DIDA's is a mean over its expert's steps and its student's. The results on this page have `tokens=1280`."
+    rest = (
+        "DIDA's is a mean over its expert's steps and its student's. VDPO's results with `matched` have `tokens=1280`."
+    )
     return f"{table}\n\n{env}. {rest}"
 
 

@@ -320,7 +320,10 @@ def test_a_batch_without_a_step_leaves_a_learned_temperature() -> None:
     windows = counter("truncated")
     fresh = dataclasses.replace(windows, age=jnp.zeros_like(windows.age))
     state = agent.init(COUNTER, jax.random.key(1))
-    for batch, moves in ((fresh, False), (windows, True)):
-        after, metrics = jax.jit(agent.update)(state, batch, jax.random.key(2), jnp.int32(0))
+    for batch, moves in ((windows, True), (fresh, False)):
+        before = state.log_temperature, state.temperature_opt_state
+        state, metrics = jax.jit(agent.update)(state, batch, jax.random.key(2), jnp.int32(0))
         assert (metrics["target_steps"] > 0) == moves
-        assert (after.log_temperature != state.log_temperature) == moves
+        after = state.log_temperature, state.temperature_opt_state
+        pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
+        assert [bool((a != b).all()) for a, b in pairs] == [moves] * len(jax.tree.leaves(before))

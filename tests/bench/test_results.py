@@ -200,7 +200,7 @@ def test_what_is_collected_stays(finished, tmp_path: Path) -> None:
     assert collect(grid, runs, less) == 8
     assert less.read_bytes() == whole
     (part / grid.cells[0].folder / "seed0" / "config.json").unlink()
-    words = r"seed0 is not a run folder: it has no config\.json.*: move .*[0-9a-f]{12} elsewhere"
+    words = r"seed0 has lost its config\.json: move .*[0-9a-f]{12} elsewhere"
     with pytest.raises(delayrl.DelayRLError, match=words):
         collect(grid, part, file)
 

@@ -1,6 +1,7 @@
 """Running a grid on this machine: cells are skipped, resumed, tried again, stopped, locked."""
 
 import contextlib
+import json
 import os
 import random
 import signal
@@ -302,6 +303,13 @@ def test_workers_that_do_not_stop_are_killed(tmp_path: Path, monkeypatch) -> Non
     completion = run_cells(cells("sac", "bpql"), tmp_path, backend, time_limit=1)
     assert time.monotonic() - began < 20
     assert {cell.condition.agent for cell in completion.unfinished} == {"sac", "bpql"}
+
+
+def test_the_last_line_may_be_long(tmp_path: Path) -> None:
+    for size in (0, 10_000, 50_000):
+        metrics = "".join(json.dumps({"step": step, "note": "x" * size}) + "\n" for step in (1, 2, 3))
+        (tmp_path / "metrics.jsonl").write_text(metrics + '{"step": 4')
+        assert folders.newest_metrics(tmp_path) == {"step": 3}
 
 
 def test_journal_after_a_crash(tmp_path: Path) -> None:

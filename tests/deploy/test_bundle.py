@@ -381,21 +381,36 @@ def test_a_bundle_that_could_not_be_read_is_not_written(bundle: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "idle", [None, 1.0, [], [1.0], [1.0, 2.0, 3.0], [1.0, "2"], [True, 0.0], [1e39, 0.0], [10**400, 0.0], {"0": 1.0}]
+    ("name", "bad", "unknown", "good"),
+    [
+        (
+            "idle",
+            [1.0, [], [1.0], [1.0, 2.0, 3.0], [1.0, "2"], [True, 0.0], [1e39, 0.0], [10**400, 0.0]],
+            None,
+            [1, -0.5],
+        ),
+        ("ages", [[], 2, ["2", 4], [True, 4], [-1, 4], [9, 9], [0.5, 4], [2, 3], [3, 2], [4]], 0, [2, 4]),
+        ("action_delay", [5, -1, 1.0, "1", True, []], 0, 3),
+        ("dt", [0, -1, "1", True, 1e300, [1]], None, 0.5),
+    ],
 )
-def test_an_idle_action_that_is_none(bundle: Path, idle: Any) -> None:
-    forge(bundle, lambda document: document.update(idle=idle))
-    assert load_bundle(bundle).idle is None
-    forge(bundle, lambda document: document.update(idle=[1, -0.5]))
-    assert load_bundle(bundle).idle.tolist() == [1, -0.5]
+def test_what_a_bundle_says_of_itself(bundle: Path, name: str, bad: list, unknown: Any, good: Any) -> None:
+    """What is absent or null is unknown, as in older bundles; what cannot be is refused."""
 
+    def value() -> Any:
+        own = getattr(load_bundle(bundle), {"ages": "min_age"}.get(name, name))
+        return own.tolist() if isinstance(own, np.ndarray) else own
 
-@pytest.mark.parametrize("ages", [None, [], 2, ["2", 3], [True, 3], [-1, 3], [9, 3], [0.5, 3]])
-def test_a_shortest_age_that_is_none(bundle: Path, ages: Any) -> None:
-    forge(bundle, lambda document: document.update(ages=ages))
-    assert load_bundle(bundle).min_age == 0
-    forge(bundle, lambda document: document.update(ages=[2, 3]))
-    assert load_bundle(bundle).min_age == 2
+    for wrong in bad:
+        forge(bundle, lambda document, wrong=wrong: document.update({name: wrong}))
+        with pytest.raises(DelayRLError, match=rf"bundle.json is damaged: {name} is "):
+            load_bundle(bundle)
+    forge(bundle, lambda document: document.update({name: None}))
+    assert value() == unknown
+    forge(bundle, lambda document: document.pop(name))
+    assert value() == unknown
+    forge(bundle, lambda document: document.update({name: good}))
+    assert value() == (good[0] if name == "ages" else good)
 
 
 @settings(max_examples=150, deadline=None, database=None)

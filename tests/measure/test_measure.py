@@ -444,6 +444,18 @@ def test_a_given_unit_is_believed(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert slow.step == 5
 
 
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_the_last_command_is_an_echo_where_commands_are_held(rows: int, tmp_path: Path) -> None:
+    """Rows may be closer than commands; the command before is then as many rows back."""
+    u, y = (np.repeat(signal, rows) for signal in signals("servo", 3))
+    last = np.append(np.zeros(rows), u[:-rows])
+    columns = {"time": ROW / rows * np.arange(len(u)), "command": u, "obs": y}
+    alone = from_log(write(tmp_path / "alone.csv", columns))
+    e = from_log(write(tmp_path / "log.csv", columns | {"obs_last": last}))
+    assert (alone.echoes, e.echoes) == ((), ("obs_last",))
+    assert (e.delay, e.low, e.high) == (alone.delay, alone.low, alone.high)
+
+
 def test_smooth_commands_make_no_echo(tmp_path: Path) -> None:
     """Their increments are alike for some rows, so those of a plant that answers rows later are like theirs at once."""
     rng = np.random.default_rng(0)
@@ -932,6 +944,11 @@ def replaced(values: np.ndarray, row: int, by: object) -> list:
         ({"time": TIME, "command": TIME * 0, "obs": OBS}, "every command is constant"),
         ({"time": TIME, "command": COMMAND, "obs": TIME * 0 + 3}, "every observation is constant"),
         ({"when": TIME, "command": COMMAND, "obs": OBS}, "no column time"),
+        (
+            {"time": ["2026-03-01T00:00:00"] * len(TIME), "command": COMMAND, "obs": OBS},
+            "write times as numbers, such as",
+        ),
+        ({"time": [f"0,{i:03}" for i in range(400)], "command": COMMAND, "obs": OBS}, "with decimal points"),
         ({"time": TIME, "torque": COMMAND, "obs": OBS}, "--commands"),
         ({"time": TIME, "command": COMMAND, "angle": OBS}, "--observations"),
         (
@@ -952,6 +969,7 @@ def test_bad_files_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("binary.csv", bytes(range(256)), "neither CSV text nor a Parquet file"),
         ("numbers.csv", b"1,2,3\n4,5,6\n", "no header"),
         ("text.txt", b"hello\nworld\n", "no header"),
+        ("comment.csv", b"# my robot\ntime,command,obs\n", "('# my robot'): a CSV file begins with the names of its"),
         ("ragged.csv", b"time,command,obs\n0,1,2\n1,2\n", "row 2: 2 cells under 3"),
         ("twice.csv", b"time,obs,obs\n0,1,2\n", "two columns of the same name"),
     ):

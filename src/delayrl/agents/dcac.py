@@ -14,6 +14,7 @@ episode's start, where d grows by one per step and nothing arrives.
 Deviations from the paper and from the released code are numbered in docs/algorithms/dcac.md.
 """
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, NamedTuple
 
@@ -124,12 +125,12 @@ class DCAC:
             return state, metrics
 
         def loss(log_temperature: Array) -> tuple[Array, None]:
-            known = metrics["target_steps"] > 0  # else the batch has no step, and no entropy
-            target = -float(windows.action.shape[-1])
-            return known * temperature_loss(log_temperature, -metrics["entropy"], target), None
+            return temperature_loss(log_temperature, -metrics["entropy"], -float(windows.action.shape[-1])), None
 
-        adam = optax.adam(TEMPERATURE_RATE)
-        log_temperature, opt_state, _, _ = descend(adam, loss, state.log_temperature, state.temperature_opt_state)
+        adam, old = optax.adam(TEMPERATURE_RATE), (state.log_temperature, state.temperature_opt_state)
+        new = descend(adam, loss, *old)[:2]
+        known = metrics["target_steps"] > 0  # else the batch has no step, and no entropy
+        log_temperature, opt_state = jax.tree.map(functools.partial(jnp.where, known), new, old)
         state = state._replace(log_temperature=log_temperature, temperature_opt_state=opt_state)
         return state, metrics | {"temperature": temperature}
 

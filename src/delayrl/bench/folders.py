@@ -107,7 +107,9 @@ def damage(folder: Path, cell: "Cell") -> str:
 
 
 def check_length(run: RunFolder, cell: "Cell") -> None:
-    """Raise DelayRLError if a cell's run was trained further than the cell, or its configuration is damaged."""
+    """Raise DelayRLError if a cell's run has other steps than the cell, or its configuration is damaged or gone."""
+    if not run.exists:
+        raise DelayRLError(f"{run.path} has lost its config.json")
     if (trained := run.config["schedule"]["steps"]) != cell.condition.steps:
         line = f"{run.path} was trained for {trained:,} steps, and its cell for {cell.condition.steps:,}"
         raise DelayRLError(line)
@@ -128,9 +130,11 @@ def _last_line(file: Path) -> dict[str, Any]:
     """Return the object in the last complete line of a file, empty if there is none."""
     try:
         with open(file, "rb") as lines:
-            lines.seek(0, os.SEEK_END)
-            lines.seek(max(0, lines.tell() - 8192))
-            return _loaded(lines.read().split(b"\n")[:-1][-1].decode(errors="replace"))
+            end, read, block = lines.seek(0, os.SEEK_END), b"", 8192
+            while len(read) < end and read.count(b"\n") < 3:  # what is before the last two may be half a line
+                lines.seek(max(0, end - block))
+                read, block = lines.read(end), 2 * block
+        return _loaded(read.split(b"\n")[:-1][-1].decode(errors="replace"))
     except (OSError, IndexError):
         return {}
 

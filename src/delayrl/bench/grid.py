@@ -136,9 +136,10 @@ def _expand(table: dict[str, Any], source: Path, included: bool = False) -> list
         with _in_product(number if "product" in table else 0):
             _check_keys(item, PRODUCT, "a product")
             own = item.get("overrides", {})
-            wholes.append(shared | item | {"overrides": _merge(shared["overrides"], own)})
-            _check_lists(wholes[-1])
-            _check_overrides(own, wholes[-1]["agents"])
+            whole = shared | item | {"overrides": _merge(shared["overrides"], own)}
+            _check_lists(whole)
+            _check_overrides(own, whole["agents"])
+            wholes.append(whole)
     if not cells and not wholes:
         raise DelayRLError("there are no products, so nothing to run")
     _check_overrides(shared["overrides"], [agent for whole in wholes for agent in whole["agents"]])

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid
-from delayrl.bench.status import is_lost, progress
+from delayrl.bench.status import is_damaged, progress
 from delayrl.errors import DelayRLError, count
 from delayrl.run.cell import Cell, CellState, Progress
 from delayrl.run.cost import Cost
@@ -149,7 +149,7 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
         if elsewhere and (best[:2] > here[:2] or (best > here and not begun)):
             total += _copy_cell(table, elsewhere, cell, number)
             continue
-        if is_lost(cell, runs, p):
+        if is_damaged(cell, runs, p):
             raise DelayRLError(p.line)
         _insert_cell(table, cell, number, p)
         total += sum(_insert_run(table, cell, path, seed, rows) for path, seed, rows in found if rows)

@@ -22,14 +22,14 @@ def progress(cell: Cell, runs: Path) -> Progress:
     if holder is not None:
         return Progress("running", max(step, int(metrics.get("step", 0))), speed, holder)
     if complete:
-        lost = folders.damage(folder, cell)
-        return Progress("failed" if lost else "done", step, speed, lost)
+        damage = folders.damage(folder, cell)
+        return Progress("failed" if damage else "done", step, speed, damage)
     if events and events[-1]["event"] == "failed":
         return Progress("failed", step, speed, str(events[-1].get("line", "")))
     return Progress("begun" if step else "todo", step, speed)
 
 
-def is_lost(cell: Cell, runs: Path, progress: Progress) -> bool:
+def is_damaged(cell: Cell, runs: Path, progress: Progress) -> bool:
     """Tell whether a cell is complete and damaged. One that failed otherwise goes on from what it stored."""
     return progress.state == "failed" and folders.stored(runs / cell.folder, cell.seeds)[1]
 
@@ -100,7 +100,8 @@ def closing_lines(name: str, standing: Standing, workers: int) -> list[str]:
 
 def failures(standing: Standing) -> list[str]:
     """Return a line for each cell that failed."""
-    return [f"failed: {cell} ({cell.id}): {p.line}" for cell, p in standing if p.state == "failed"]
+    failed = [(cell, p) for cell, p in standing if p.state == "failed"]
+    return [f"failed: {cell} ({cell.id})" + (f": {p.line}" if p.line else "") for cell, p in failed]
 
 
 def duration(seconds: float) -> str:

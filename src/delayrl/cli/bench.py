@@ -9,7 +9,7 @@ from typing import Any
 
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid, shipped
-from delayrl.bench.status import HEAD, closing_lines, duration, failures, is_lost, line, progress, standing, table
+from delayrl.bench.status import HEAD, closing_lines, duration, failures, is_damaged, line, progress, standing, table
 from delayrl.cli.console import StatusLine, positive, print_table
 from delayrl.errors import STOPPED, DelayRLError, count
 from delayrl.run.cell import Cell
@@ -123,7 +123,7 @@ def _report(grid: Grid | None, given: argparse.Namespace) -> None:
     else:
         folder, name, description = given.runs, grid.name, grid.description
         cells = standing(grid.cells, given.runs)
-        whole = [cell for cell, progress in cells if not is_lost(cell, given.runs, progress)]
+        whole = [cell for cell, progress in cells if not is_damaged(cell, given.runs, progress)]
         rows, configs = rows_of(whole, given.runs), configs_of(whole, given.runs)
     page = report(rows, cells, given.out or folder / f"{name}-report", name, configs, description)
     done = sum(progress.state == "done" for _, progress in cells)

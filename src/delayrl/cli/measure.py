@@ -168,8 +168,9 @@ def _show_correlation(e: Estimated) -> list[str]:
         f"{'dead time':<26}{_ms(e.delay)}, 95 % between {_ms(e.low)} and {_ms(e.high)}",
         f"{'':<26}{e.strength:.1f} times what chance gives in one log of a thousand",
         f"{'increments correlate most':<26}{peak}",
-        f"{'':<26}(that is the dead time, the plant's own lag, and a row)",
     ]
+    if e.peak.lag >= e.delay:  # with feedback in the commands it may be earlier
+        lines.append(f"{'':<26}(that is the dead time, the plant's own lag, and a row)")
     if e.echoes:
         lines.append(f"{', '.join(e.echoes)} {'repeats' if len(e.echoes) == 1 else 'repeat'} a command:")
         kept = e.peak.observation in e.echoes

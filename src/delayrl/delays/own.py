@@ -54,7 +54,7 @@ class OwnLaw:
         whole = isinstance(travel, int | np.integer) and not isinstance(travel, bool)
         if not whole or not 0 <= travel <= self.maximum:
             allowed = f"a travel time is a whole number of steps from 0 to its maximum, {self.maximum}"
-            raise DelayRLError(f"{self.text} drew {travel!r}: {allowed}")
+            raise DelayRLError(f"{self.text} drew {travel!s:.80}: {allowed}")
         return int(travel), state
 
     def __str__(self) -> str:

@@ -116,7 +116,8 @@ def _layers_of(env: Any) -> tuple[Delayed, AugmentedObservation | None]:
     if delayed is None:
         raise DelayRLError("adapt takes the environment that the policy was trained in, with its Delayed: got none")
     if not delayed.delay.action.constant:
-        raise DelayRLError(f"a controller has one delay of the actions; got {delayed.delay.action}: use its longest")
+        hint = "train with a constant one, or with @wait behind its law"
+        raise DelayRLError(f"a controller has one delay of the actions; got {delayed.delay.action}: {hint}")
     for layer in takewhile(lambda layer: layer is not delayed, layers_of(env)):
         if isinstance(layer, AugmentedObservation):
             augmented = layer

@@ -39,20 +39,13 @@ class Bundle:
         for bound in (self.low, self.high):  # they clip every action
             bound.setflags(write=False)
         self.max_age = network.max_age
-        dt: Any = metadata.get("dt")
-        self.dt = float(dt) if type(dt) in (int, float) and SHORTEST_STEP <= dt <= LONGEST_STEP else None
-        ages: Any = metadata.get("ages")
-        self.min_age = self._steps(ages[0] if isinstance(ages, list) and ages else 0)
-        self.action_delay = self._steps(metadata.get("action_delay"))
-        self.idle = _idle(metadata.get("idle"), network.action_size)
+        self.dt = _dt(metadata)
+        self.min_age, self.action_delay = _min_age(metadata, self.max_age), _action_delay(metadata, self.max_age)
+        self.idle = _idle(metadata, network.action_size)
 
     def __repr__(self) -> str:
         made = f"{self.metadata.get('agent')} on {self.metadata.get('env')}"
         return f"Bundle({made}, ages {self.min_age}..{self.max_age}, backend {self.backend})"
-
-    def _steps(self, given: Any) -> int:
-        """Return a number of steps in a bundle.json; 0 if it has none, or something else."""
-        return given if type(given) is int and 0 <= given <= self.max_age else 0
 
     def __call__(self, obs: ArrayLike, actions: ArrayLike, age: int) -> NDArray[np.float32]:
         """Compute the deterministic action. Calls do not depend on each other.
@@ -114,10 +107,48 @@ def load_bundle(path: str | Path, backend: str = "numpy") -> Bundle:
     return Bundle(network, metadata, policy(network, arrays), backend)
 
 
-def _idle(given: Any, size: int) -> NDArray[np.float32] | None:
-    """Return the idle action in a bundle.json; None if it has none, or something else."""
-    if not isinstance(given, list) or len(given) != size:
+def _dt(metadata: dict[str, Any]) -> float | None:
+    """Return the length of a step in a bundle.json, None if it has none. All of these refuse what cannot be."""
+    dt = metadata.get("dt")
+    if dt is None:
+        return None
+    if type(dt) not in (int, float) or not SHORTEST_STEP <= dt <= LONGEST_STEP:
+        raise _unusable("dt", dt, f"seconds from {SHORTEST_STEP:g} to {LONGEST_STEP:g}")
+    return float(dt)
+
+
+def _min_age(metadata: dict[str, Any], longest: int) -> int:
+    """Return the shortest age in a bundle.json, 0 if it has none."""
+    ages: Any = metadata.get("ages")
+    if ages is None:
+        return 0
+    pair = isinstance(ages, list) and len(ages) == 2 and all(type(age) is int for age in ages)
+    if not pair or not 0 <= ages[0] <= ages[1] == longest:
+        raise _unusable("ages", ages, f"the shortest and the longest, {longest}")
+    return int(ages[0])
+
+
+def _action_delay(metadata: dict[str, Any], longest: int) -> int:
+    """Return the delay of actions in a bundle.json, 0 if it has none."""
+    steps: Any = metadata.get("action_delay")
+    if steps is None:
+        return 0
+    if type(steps) is not int or not 0 <= steps <= longest:
+        raise _unusable("action_delay", steps, f"whole steps from 0 to {longest}")
+    return steps
+
+
+def _idle(metadata: dict[str, Any], size: int) -> NDArray[np.float32] | None:
+    """Return the idle action in a bundle.json, None if it has none."""
+    idle = metadata.get("idle")
+    if idle is None:
         return None
     largest = float(np.finfo(np.float32).max)
-    valid = all(type(x) in (int, float) and abs(x) <= largest for x in given)
-    return np.asarray(given, np.float32) if valid else None
+    sized = isinstance(idle, list) and len(idle) == size
+    if not sized or not all(type(x) in (int, float) and abs(x) <= largest for x in idle):
+        raise _unusable("idle", idle, f"{size} numbers")
+    return np.asarray(idle, np.float32)
+
+
+def _unusable(name: str, value: Any, allowed: str) -> DelayRLError:
+    return DelayRLError(f"bundle.json is damaged: {name} is {value!r:.60}, and must be {allowed}")

@@ -49,13 +49,16 @@ def increments(values: Array, episode: Array) -> Array:
 
 
 def echoes(commands: Array, observations: Array, episode: Array) -> Mask:
-    """Return which observations repeat a command of their row or of the row before, such as a set-point: [Y].
+    """Return which observations repeat a command of their row or the one before it, such as a set-point: [Y].
 
-    Increments of smooth commands are like those of some rows later, so an echo is most like a command at once.
+    The one before is a row back, or as many rows as commands are held. Increments of smooth commands are like those of
+    some rows later, so an echo is most like a command at once.
     """
     u, y = increments(commands, episode), increments(observations, episode)
-    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in range(min(2 * ORDER, len(u)))])
-    early = r[:2].max(0)
+    held = np.diff(np.flatnonzero(np.diff(commands, axis=0).any(1)))
+    before = int(np.median(held)) if len(held) else 1
+    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in range(min(max(2 * ORDER, before + 1), len(u)))])
+    early = r[[lag for lag in (0, 1, before) if lag < len(r)]].max(0)
     return ((early > ECHO) & (early >= r.max(0))).any(0)
 
 

@@ -153,12 +153,16 @@ class Table:
         """Return the name of a column: the given one or else a usual one, or "" if there is none and none is needed."""
         wanted = (given,) if given else usual
         for name in wanted:
-            if name in self._columns:
-                return name
+            if same := [known for known in self.names if known == name] or self._alike(name):
+                return same[0]
         if needed or given is not None:
             hint = f"name it with {option}. It has {_few(self.names)}"
             raise DelayRLError(f"{self.path}: no column {' or '.join(map(str, wanted))} for the {what}; {hint}")
         return ""
+
+    def _alike(self, name: str) -> list[str]:
+        """Return the columns of this name in other letters."""
+        return [known for known in self.names if known.lower() == name.lower()]
 
     def column(self, name: str) -> Array:
         """Return a column of numbers, [N]."""
@@ -188,7 +192,7 @@ class Table:
             row = next((i for i, cell in enumerate(cells) if not _number(cell)), 0)
             shown = "an empty cell" if cells[row] in ("", None) else f"{cells[row]!r}, which is not a number"
             where = f"{self.path}, row {row + 1}"
-            raise DelayRLError(f"{where}: column {name} has {shown}; drop such rows or fill them") from None
+            raise DelayRLError(f"{where}: column {name} has {shown}; {_instead(cells[row])}") from None
         values = values.reshape(len(values), -1)
         invalid = ~np.isfinite(values).all(1)
         if invalid.any():
@@ -219,7 +223,8 @@ def _csv(path: Path) -> dict[str, list[str]]:
         raise DelayRLError(f"{path} is neither CSV text nor a Parquet file: {error}") from None
     names = [name.strip() for name in rows[0]] if rows else []
     if len(names) < 2 or all(map(_number, names)):
-        raise DelayRLError(f"{path} has no header of column names in its first line; or it is neither CSV nor Parquet")
+        form = "a CSV file begins with the names of its columns, separated by commas, semicolons or tabs"
+        raise DelayRLError(f"{path} has no header of column names in its first line ({header!r:.60}): {form}")
     if len(set(names)) < len(names):
         twice = sorted(name for name in names if names.count(name) > 1)
         raise DelayRLError(f"{path} has two columns of the same name: {_few(twice)}")
@@ -256,6 +261,16 @@ def _number(cell: Any) -> bool:
         return cell is not None and math.isfinite(float(cell))
     except (TypeError, ValueError):
         return False
+
+
+def _instead(cell: Any) -> str:
+    """Write what to do about a cell that is no number: a decimal comma, a date, or one that is missing."""
+    text = str(cell)
+    if _number(text.replace(",", ".", 1)):
+        return "write numbers with decimal points"
+    if ":" in text or text.count("-") > 1:
+        return "write times as numbers, such as seconds from the first row"
+    return "drop such rows or fill them"
 
 
 def _few(names: Sequence[str]) -> str:

@@ -47,6 +47,8 @@ def _check_shape(env: Any, truth: Any) -> None:
 
 def _one_line(env: Any, method: str, error: BaseException) -> DelayRLError:
     frames = traceback.extract_tb(error.__traceback__)
-    place = ([frame for frame in frames if is_users(frame.filename)] or frames)[-1]
-    where = f"{Path(place.filename).name}, line {place.lineno}"
+    own = [frame for frame in frames if is_users(frame.filename)]
+    place = (own or frames)[-1]
+    file = Path(place.filename).parts[-1 if own else -3 :]  # of a library, such as gymnasium/wrappers/common.py
+    where = f"{'/'.join(file)}, line {place.lineno}"
     return DelayRLError(f"{name_of(env)} failed in {method}: {described(error)} ({where})")

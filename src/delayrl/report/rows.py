@@ -16,6 +16,7 @@ from delayrl.run.rows import CONDITION, CONFIGURATION, Row, name_configuration, 
 from delayrl.run.stored import condition_of
 
 LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
+LARGEST = 1e300  # return; sums stay finite
 
 
 Key = tuple[Any, ...]
@@ -58,7 +59,7 @@ class RowGroup:
     def runs(self, policy: str) -> dict[int, dict[int, float]]:
         """Return the mean return of a policy by seed and step, without evaluations that a crash cut off."""
         return {
-            seed: {step: _mean(curve[step]) for step in whole_evaluations(curve)}
+            seed: {step: math.fsum(curve[step].values()) / len(curve[step]) for step in whole_evaluations(curve)}
             for (name, seed), curve in self.curves.items()
             if name == policy
         }
@@ -74,7 +75,7 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
             key = (row.get("cell"), row.get(CONFIGURATION), *condition)
             if not (type(seed) is type(step) is type(episode) is int and 0 <= step < LIMIT and episode >= 0):
                 raise TypeError
-            if not math.isfinite(value):
+            if not abs(value) < LARGEST:
                 raise ValueError
             if key not in groups:
                 groups[key] = _group(row)
@@ -90,11 +91,6 @@ def group_rows(rows: Iterable[Mapping[str, Any]]) -> list[RowGroup]:
             groups[key].physics.add((str(row.get("mujoco")), str(row["physics"])))
         returns[episode] = value
     return list(groups.values())
-
-
-def _mean(returns: Returns) -> float:
-    """Return the mean, rounded once: the same with any Python, and finite however large the returns are."""
-    return math.fsum(value / len(returns) for value in returns.values())
 
 
 def _group(row: Mapping[str, Any]) -> RowGroup:

@@ -111,5 +111,5 @@ def disk_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         reason = "the disk is full" if error.errno == errno.ENOSPC else (error.strerror or str(error))
-        kept = "; what was stored before is kept" if path.exists() else ""
+        kept = "; what was stored before is kept" if os.path.exists(path) else ""  # Path.exists may raise
         raise DelayRLError(f"cannot write to {path}: {reason}{kept}") from error

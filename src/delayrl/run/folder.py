@@ -151,9 +151,7 @@ class RunFolder:
             if isinstance(found, Checkpoint):
                 return found
             broken.append(found)
-        if broken:
-            raise DelayRLError(f"{broken[0]}; --overwrite starts afresh")
-        raise DelayRLError(f"{self.path} has no checkpoint yet")
+        raise DelayRLError(broken[0] if broken else f"{self.path} has no checkpoint yet")
 
     def _checked(self, *, replay: bool) -> Iterator[Checkpoint | str]:
         """Yield the checkpoints, newest first, a line for a broken one; with the replay of unfinished ones or not."""

@@ -7,17 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
 from delayrl.play.evaluation import check_seed
 from delayrl.run.condition import Condition
 from delayrl.run.folder import RunFolder
 
+Seeds = int | Sequence[int] | NDArray[np.integer[Any]]
+"""How many, or which."""
 MOST = 10_000
 """Seeds that one call may train: they are trained in lockstep."""
 
 
-def seed_numbers(seed: int, seeds: int | Sequence[int] | None) -> list[int]:
+def seed_numbers(seed: int, seeds: Seeds | None) -> list[int]:
     """Return the seeds to train: `seeds` many from `seed` on, those listed, or one. Raises DelayRLError if bad."""
     check_seed(seed)
     if seeds is None:
@@ -27,13 +30,14 @@ def seed_numbers(seed: int, seeds: int | Sequence[int] | None) -> list[int]:
             raise DelayRLError(f"seeds must be from 1 to {MOST:,}; got {seeds}")
         numbers: list[Any] = list(range(seed, seed + seeds))
     else:
-        numbers = list(seeds) if isinstance(seeds, Sequence | np.ndarray) and not isinstance(seeds, str) else []
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise DelayRLError(f"seeds is a number, or a list of different seeds; got {seeds!r}")
+        given = seeds.tolist() if isinstance(seeds, np.ndarray) else seeds
+        numbers = list(given) if isinstance(given, Sequence) and not isinstance(given, str | bytes) else []
         if seed:
-            raise DelayRLError(f"a list of seeds is given without seed=; got seed={seed}, seeds={seeds!r}")
+            raise DelayRLError(f"seeds that are listed are given without seed=; got seed={seed}, seeds={seeds!r}")
     for number in numbers:
         check_seed(number)
+    if not numbers or len({*numbers}) < len(numbers):
+        raise DelayRLError(f"seeds is a number, or a list of different seeds; got {seeds!r}")
     return [int(number) for number in numbers]
 
 

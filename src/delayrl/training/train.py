@@ -31,7 +31,7 @@ from delayrl.training.loop import run
 from delayrl.training.machine import shared
 from delayrl.training.origin import source_of
 from delayrl.training.resume import start
-from delayrl.training.seeds import run_folders, seed_numbers
+from delayrl.training.seeds import Seeds, run_folders, seed_numbers
 from delayrl.training.signals import stop_signal
 from delayrl.training.state import Callback, Group, Ways
 
@@ -61,9 +61,7 @@ def train(
     **values: Any,
 ) -> Run: ...
 @overload
-def train(
-    agent: AgentLike, env: TaskLike, delay: DelayLike = ..., *, seeds: int | Sequence[int], **more: Any
-) -> list[Run]: ...
+def train(agent: AgentLike, env: TaskLike, delay: DelayLike = ..., *, seeds: Seeds, **more: Any) -> list[Run]: ...
 def train(
     agent: AgentLike,
     env: TaskLike,
@@ -74,7 +72,7 @@ def train(
     flatten: bool = False,
     preset: str = "paper",
     seed: int = 0,
-    seeds: int | Sequence[int] | None = None,
+    seeds: Seeds | None = None,
     out: str | Path | None = None,
     device: str | None = None,
     overwrite: bool = False,

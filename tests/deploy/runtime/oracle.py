@@ -93,10 +93,15 @@ class Oracle:
         With `until`, there is one more beginning: that of the step of a command at that time.
         """
         s, begins, actions, missed, replaced = self.setting, [], [], 0, 0
+        goes_on: set[int] = set()  # steps without a command that repeat the one before
         commands = [e for e in self.log if e[0] != "obs"] + ([("command", until, None)] if until is not None else [])
         for kind, when, action in commands:
-            if kind == "fix":
+            if kind == "fix":  # what the plant went on with, it went on with as corrected
                 actions[int(when)] = action
+                for i in range(int(when) + 1, len(actions)):
+                    if i not in goes_on:
+                        break
+                    actions[i] = action
                 continue
             begin = when + s.action_delay * s.period
             if not begins:
@@ -115,6 +120,8 @@ class Oracle:
                     continue
                 missed += gap - 1
                 for _ in range(gap - 1):
+                    if s.idle is None:
+                        goes_on.add(len(actions))
                     begins.append(begins[-1] + s.period)
                     actions.append(actions[-1] if s.idle is None else s.idle)
             begins.append(begin)

@@ -438,6 +438,20 @@ def test_what_the_plant_really_did() -> None:
         controller.applied([0.0], 4)
 
 
+def test_a_report_that_comes_after_missed_steps_corrects_them_too() -> None:
+    """The plant went on with what it did; what was commanded since, and what `idle` says, stays."""
+    for idle, history in ((None, [0.5, 0.5, 0.5, 0.25]), ([0.0], [0.5, 0.0, 0.0, 0.25])):
+        policy = Counting(1, 8)
+        controller = Controller(policy, dt=None, idle=idle)
+        controller.observe([0.0], 0, now=0)
+        controller.act(0)
+        controller.act(3)
+        controller.applied([0.25])
+        assert controller.applied([0.5], 0)
+        controller.act(4)
+        assert policy.calls[-1][1][:4] == history
+
+
 def test_actions_in_flight_add_to_the_age() -> None:
     """With κ = 2 the plant does the n-th action in step n + 2; before that it is idle."""
     policy = counting(4)

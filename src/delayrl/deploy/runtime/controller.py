@@ -136,7 +136,7 @@ class Controller:
         self.action_delay = _steps(policy, "action_delay", action_delay)
         self.min_age = _steps(policy, "min_age", min_age)
         self._clock = Clock(stamps, getattr(policy, "dt", None) if stamps == "seconds" and dt is None else dt, clock)
-        _warn_of_period(policy, self._clock)
+        _warn_of_dt(policy, self._clock)
         self._act_lock, self._state_lock = threading.Lock(), threading.Lock()  # always taken in this order
         self._telemetry = Telemetry(stamps)
         actions = None if idle is None else _action(policy, idle, "idle"), _first_action(policy)
@@ -313,7 +313,7 @@ def _check(policy: ControlPolicy) -> None:
         raise DelayRLError(f"{line}; got {low.tolist()} and {high.tolist()}")
 
 
-def _warn_of_period(policy: ControlPolicy, clock: Clock) -> None:
+def _warn_of_dt(policy: ControlPolicy, clock: Clock) -> None:
     """Warn if steps are far from as long as those that the policy learned with."""
     learned = getattr(policy, "dt", None)
     if clock.stamps == "seconds" and learned and not 0.9 < clock.dt / learned < 1.1:

@@ -143,7 +143,10 @@ class History:
         self.length += gap
 
     def correct(self, action: Action, step: int | None) -> bool:
-        """Replace the action of a step, of the newest if None. Returns False if the step is no longer remembered."""
+        """Replace the action of a step, of the newest if None, and where the plant went on with it after that.
+
+        Returns False if the step is no longer remembered.
+        """
         try:
             number = self.length - 1 if step is None else operator.index(step)
         except TypeError:
@@ -151,9 +154,13 @@ class History:
         if not 0 <= number < self.length:
             raise DelayRLError(f"there are actions of {self.length} steps, from 0 on; got step {number}")
         position = number - (self.length - len(self._actions))
-        if position >= 0:
-            self._actions[position] = action
-        return position >= 0
+        if position < 0:
+            return False
+        corrected, own = self._actions[position], self._idle is not None or self._actions[position] is self._first
+        self._actions[position] = action
+        while not own and (position := position + 1) < len(self._actions) and self._actions[position] is corrected:
+            self._actions[position] = action  # of a step without a command, in which the plant went on
+        return True
 
     def _gap(self, now: float, elapsed: int) -> int:
         """Return the steps from the newest step to that of a command at `now`; 0 if they are the same."""
