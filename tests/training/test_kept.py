@@ -174,6 +174,9 @@ def test_a_run_is_trained_by_one_process(tmp_path: Path) -> None:
 def test_what_is_refused_leaves_no_folder(tmp_path: Path) -> None:
     source = train("random", tmp_path / "source", steps=101)
     (tmp_path / "file").write_text("mine")
-    for out, why in ((tmp_path / "a" / "b", "no network that fits"), (tmp_path / "file", "is a file; give another --out")):
+    for out, why in (
+        (tmp_path / "a" / "b", "no network that fits"),
+        (tmp_path / "file", "is a file; give another --out"),
+    ):
         assert_refused(tmp_path, why, lambda out=out: train("bpql", out, start_from=source))
     assert {path.name for path in tmp_path.iterdir()} == {"source", "file"}
