@@ -268,6 +268,7 @@ def test_channels_of_a_text() -> None:
         ("soon", "is not a number"),
         ("nan", "is not a number"),
         ("", "is not a number"),
+        ("recorded:log.csv:us", "s or ms; got 'us'"),
         ("unifrom:1:5", "unknown delay 'unifrom:1:5'; did you mean uniform?"),
         ("uniform:5:1", "LOW ≤ HIGH"),
         ("uniform:1", "takes 2 values between colons"),

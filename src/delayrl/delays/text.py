@@ -162,7 +162,8 @@ class DelayParser:
                 return laws.Recorded(tuple(int(word) for word in rest.split(",") if word))
             case "recorded" if self._folder is None:  # a run folder holds the numbers, and may come from elsewhere
                 path, _, unit = rest.rpartition(":")
-                return recorded(path, self.step_seconds, unit) if path and unit in ("s", "ms") else recorded(rest)
+                timed = path and unit in ("s", "ms", "us", "ns")  # `recorded` says which units it takes
+                return recorded(path, self.step_seconds, unit) if timed else recorded(rest)
         near = near_names(name, [*LAWS, *PRESETS]) if name not in LAWS else []
         raise DelayRLError(f"unknown delay {part!r}{did_you_mean(near, FORMS)}")
 
