@@ -57,8 +57,9 @@ def echoes(commands: Array, observations: Array, episode: Array) -> Mask:
     u, y = increments(commands, episode), increments(observations, episode)
     held = np.diff(np.flatnonzero(np.diff(commands, axis=0).any(1)))
     before = int(np.median(held)) if len(held) else 1
-    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in range(min(max(2 * ORDER, before + 1), len(u)))])
-    early = r[[lag for lag in (0, 1, before) if lag < len(r)]].max(0)
+    lags = [lag for lag in sorted({*range(2 * ORDER), before}) if lag < len(u)]
+    r = np.abs([u[: len(u) - lag].T @ y[lag:] / len(u) for lag in lags])
+    early = r[np.isin(lags, (0, 1, before))].max(0)
     return ((early > ECHO) & (early >= r.max(0))).any(0)
 
 
