@@ -96,13 +96,14 @@ def damage(folder: Path, cell: "Cell") -> str:
 
     Of each run this reads the configuration and the last row alone: what may be missing before is not looked for.
     """
-    for run in seed_paths(folder, cell.seeds):
-        try:
-            check_length(RunFolder(run), cell)
-        except DelayRLError as error:
-            return f"{error}: {again(folder)}"
-        if _last_line(run / "rows.jsonl").get("step") != cell.condition.steps:
-            return f"{run} ended, but rows of the last evaluation are missing: {again(folder)}"
+    try:
+        with advised(folder):
+            for run in seed_paths(folder, cell.seeds):
+                check_length(RunFolder(run), cell)
+                if _last_line(run / "rows.jsonl").get("step") != cell.condition.steps:
+                    raise DelayRLError(f"{run} ended, but rows of the last evaluation are missing")
+    except DelayRLError as error:
+        return str(error)
     return ""
 
 
@@ -115,9 +116,13 @@ def check_length(run: RunFolder, cell: "Cell") -> None:
         raise DelayRLError(line)
 
 
-def again(folder: Path) -> str:
-    """Write how to get a cell with a damaged run: its seeds begin together."""
-    return f"move {folder} elsewhere, and run the cell again"
+@contextlib.contextmanager
+def advised(folder: Path) -> Iterator[None]:
+    """Add to an error how to get a cell with a damaged run: its seeds begin together."""
+    try:
+        yield
+    except DelayRLError as error:
+        raise DelayRLError(f"{error}: move {folder} elsewhere, and run the cell again") from error
 
 
 def newest_metrics(run: Path) -> dict[str, Any]:

@@ -50,12 +50,10 @@ def rows_of(cells: Sequence[Cell], runs: Path) -> Iterator[Row]:
 def _own_rows(cell: Cell, path: Path) -> list[Row]:
     """Return the rows of a cell's run. Raises DelayRLError if it was trained further than the cell, or is damaged."""
     run = RunFolder(path)
-    try:
+    with folders.advised(path.parent):
         rows = name_configuration(run.read("rows"))
         if rows:
             folders.check_length(run, cell)
-    except DelayRLError as error:
-        raise DelayRLError(f"{error}: {folders.again(path.parent)}") from error
     return rows
 
 
@@ -219,12 +217,9 @@ def configs_of(cells: Sequence[Cell], runs: Path) -> list[dict[str, Any]]:
     """Return the configurations of the runs that have begun, each with its cell's id."""
     configs = []
     for cell in cells:
-        for path in folders.seed_paths(runs / cell.folder, cell.seeds):
-            if (run := RunFolder(path)).exists:
-                try:
-                    configs.append(run.config | {"cell": cell.id})
-                except DelayRLError as error:
-                    raise DelayRLError(f"{error}: {folders.again(path.parent)}") from error
+        begun = filter(lambda run: run.exists, map(RunFolder, folders.seed_paths(runs / cell.folder, cell.seeds)))
+        with folders.advised(runs / cell.folder):
+            configs += [run.config | {"cell": cell.id} for run in begun]
     return configs
 
 

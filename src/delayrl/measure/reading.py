@@ -153,16 +153,12 @@ class Table:
         """Return the name of a column: the given one or else a usual one, or "" if there is none and none is needed."""
         wanted = (given,) if given else usual
         for name in wanted:
-            if same := [known for known in self.names if known == name] or self._alike(name):
-                return same[0]
+            if alike := [known for known in self.names if known.lower() == name.lower()]:
+                return name if name in alike else alike[0]
         if needed or given is not None:
             hint = f"name it with {option}. It has {_few(self.names)}"
             raise DelayRLError(f"{self.path}: no column {' or '.join(map(str, wanted))} for the {what}; {hint}")
         return ""
-
-    def _alike(self, name: str) -> list[str]:
-        """Return the columns of this name in other letters."""
-        return [known for known in self.names if known.lower() == name.lower()]
 
     def column(self, name: str) -> Array:
         """Return a column of numbers, [N]."""

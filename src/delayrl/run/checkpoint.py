@@ -38,10 +38,11 @@ class Checkpoint:
         pieces = self.pieces if replay else {}
         for name, checksum in (self.files | pieces).items():
             file = (folder if name in pieces else self.path) / name
-            if Path(name).name != name or "\0" in name or (file.exists() and _checksum(file) != checksum):
-                raise DelayRLError(f"{name} is cut or changed")
-            if not file.exists():
+            named = Path(name).name == name and "\0" not in name
+            if named and not file.exists():
                 raise DelayRLError(f"{name} is missing")
+            if not named or _checksum(file) != checksum:
+                raise DelayRLError(f"{name} is cut or changed")
 
 
 def checkpoint_folders(run: Path) -> list[Path]:
