@@ -153,15 +153,15 @@ def section(folder: Path, picture: Path) -> str:
     runs, heads = read(folder)
     draw(runs, picture)
     tasks = ", ".join(sorted({head["config"]["env"] for head in heads}))
-    about = f"{tasks}. Rows: `benchmarks/results/times/`. Made with:"
-    return "\n\n".join([table(runs), ratios(runs, OURS), about, made_with(heads)])
+    about = f"{tasks}. Made with {made_with(heads)}. Rows, each with its own versions: `benchmarks/results/times/`."
+    return "\n\n".join([table(runs), ratios(runs, OURS), about])
 
 
 def made_with(heads: list[dict[str, Any]]) -> str:
-    """Write a line for each set of versions: which sides and seeds it made."""
-    runs: dict[str, list[str]] = defaultdict(list)
-    for head in heads:
-        config, used = head["config"], head["versions"] | {"commit": head["versions"].get("commit") or "unknown"}
-        words = ", ".join(f"{key} {value}" for key, value in used.items() if value and key not in ("cores", "machine"))
-        runs[words].append(f"{name(config)} Δ = {config['delay']} seed {config['seed']}")
-    return "\n".join(f"- {words}: {'; '.join(made)}." for words, made in runs.items())
+    """Write the versions that made the rows, all of each package in one place."""
+    used: dict[str, set[str]] = defaultdict(set)
+    for versions in (head["versions"] for head in heads):
+        for key, value in versions.items():
+            if value and key not in ("cores", "machine"):
+                used[key].add(str(value))
+    return ", ".join(f"{key} {' and '.join(sorted(values))}" for key, values in used.items())

@@ -97,8 +97,8 @@ def parts(rows: list[Row]) -> str:
         theirs = row.get("peer", {}).get("parts", {})
         words = {"train_sac": "SAC", "train_belief": "belief", "train_kl": "cloning"}
         cells.append(", ".join(f"{words[n]} {1e3 * theirs[n]['median']:.1f}" for n in words if n in theirs))
-        body.append([row["title"].split(";")[0] + where(row, rows), *cells])
-    head = ["work", "act", "environment", "SAC and belief", "cloning", "their sum", "whole step", "peer's parts"]
+        body.append([row["title"] + where(row, rows), *cells])
+    head = ["work; peer", "act", "environment", "SAC and belief", "cloning", "their sum", "whole step", "peer's parts"]
     return markdown_table(head, body)
 
 

@@ -34,7 +34,8 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     assert ours[6:] == ["1,100", "16.7"]  # within the three minutes that all sides have
     assert theirs[2:] == ["1", "–", "–", "–", "-5", "–"]
     assert "after 3 minutes" in text
-    assert "- commit unknown: `bpql`, `matched` Δ = 5 seed 0; " in text
+    heads = [{"versions": {"jax": "0.11", "commit": None, "cores": 2}}, {"versions": {"jax": "0.12", "commit": "abc"}}]
+    assert times.made_with(heads) == "jax 0.11 and 0.12, commit abc"
     late = [times.Run([1], [60.0], [value], 3.0) for value in (0.0, 0.0, 3000.0)]
     assert times.cell(late, 1000) == "– (1 of 3 seeds)"
     fast = [times.Run([1], [24.0], [3000.0], 3.0)]
