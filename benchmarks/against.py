@@ -68,6 +68,34 @@ def table(results: list[Result], env: str = ENV) -> str:
     return markdown_table([*head, "over training", "arithmetic"], body)
 
 
+def added(files: list[Path]) -> str:
+    """Return the table of any-age's seeds in two halves: those of the plan, and those that were added later."""
+    return added_table(results_of(map(read_table, files)))
+
+
+def added_table(results: list[Result], delay: int = 25) -> str:
+    """Return a Markdown table of any-age's first and later seeds at a delay of ENV, minus each other agent.
+
+    Another agent stands with the same seeds if it has them all, else with its own five.
+    """
+    here = [r for r in front.comparable(results, VARIANTS) if (r.place.env, r.place.delay) == (ENV, delay)]
+    chosen = {front.name(result): result for result in here if front.name(result) != PLAIN}
+    own = chosen.pop(OWN)
+    halves = slice(0, front.SEEDS), slice(front.SEEDS, own.runs)
+    first, later = f"seeds 0 to {front.SEEDS - 1}", f"seeds {front.SEEDS} to {own.runs - 1}"
+    head = [
+        "other agent",
+        *(f"{seeds}, {over}" for over in ("at the end", "over training") for seeds in (first, later)),
+    ]
+    body = []
+    for name, other in sorted(chosen.items(), key=lambda item: -area(item[1]).mean()):
+        cells = []
+        for one, two in ((own.curves.final, other.curves.final), (area(own), area(other))):
+            cells += [bold(difference(one[half], two[half] if two.size == one.size else two)) for half in halves]
+        body.append([name, *cells])
+    return markdown_table(head, body)
+
+
 def welch(one: Floats, other: Floats) -> float:
     """Return the p-value of a difference of the means."""
     return float(stats.ttest_ind(one, other, equal_var=False).pvalue)

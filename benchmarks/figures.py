@@ -308,6 +308,7 @@ def main() -> None:
     insert(root / "docs" / "algorithms" / "any-age.md", "against", against.section(rows))
     poles = against.section(rows, "InvertedDoublePendulum-v5")
     insert(root / "docs" / "algorithms" / "any-age.md", "against-poles", poles)
+    insert(root / "docs" / "algorithms" / "any-age.md", "added-seeds", against.added(rows))
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)

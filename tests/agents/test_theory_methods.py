@@ -4,6 +4,8 @@ Here every fixed point is a formula or an iteration on arrays. test_fixed_points
 updates.
 """
 
+import itertools
+
 import numpy as np
 import pytest
 from fixed_points import (
@@ -51,6 +53,24 @@ def test_dida_with_a_deterministic_student_takes_the_median_or_the_mean() -> Non
     assert belief @ expert == pytest.approx(0.0)
     width = np.full((3, 1), 1e-12)
     assert moment_match(belief, expert[:, None], width)[1] == pytest.approx(0.84)  # the mixture's variance, lost
+
+
+def test_older_views_than_the_shown_one_are_confounded() -> None:
+    """Tracking under `uniform:1:3`: an action tells of hidden states, but not in samples of the view's own age."""
+    chain = tracking().transition[:, 0]
+    joint = {"all": np.zeros(2), "own age": np.zeros(2)}  # of s_t, where s_{t-3} = 0 and a_{t-1} = 1
+    for delays in itertools.product((1, 2, 3), repeat=4):  # of s_{t-4} to s_{t-1}
+        arrival = {row: row + delay for row, delay in zip(range(-4, 0), delays, strict=True)}
+        newest = {now: max(row for row in arrival if arrival[row] <= now) for now in (-1, 0)}
+        for states in itertools.product((0, 1), repeat=5):  # s_{t-4} to s_t
+            if states[1] != 0 or states[newest[-1] + 4] != 1:  # the agent names the newest state that it has seen
+                continue
+            chance = np.prod([chain[one, two] for one, two in itertools.pairwise(states)])
+            joint["all"][states[-1]] += chance
+            joint["own age"][states[-1]] += chance * (newest[0] == -3)
+    belief = np.linalg.matrix_power(chain, 3)[0, 1]
+    assert joint["all"][1] / joint["all"].sum() == pytest.approx(0.5896)
+    assert joint["own age"][1] / joint["own age"].sum() == pytest.approx(belief) == pytest.approx(0.244)
 
 
 @seeds

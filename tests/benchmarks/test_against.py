@@ -42,6 +42,17 @@ def test_rows_are_what_has_ended_at_the_same_delay() -> None:
     assert [line[5].endswith("§") for line in shown] == [False, True]
 
 
+def test_seeds_that_were_added_stand_apart() -> None:
+    """An agent with as many seeds is compared half by half, one with five with both halves of any-age."""
+    planned, later = [1.0, 2, 3, 4, 5], [11.0, 12, 13, 14, 15]
+    cells = [cell("any-age", planned + later, 25), cell("bpql", planned + later, 25), cell("lifting", planned, 25)]
+    cells += [cell("lifting", later, 50), cell("any-age", later, 25, id="plain", overrides={"critic_norm": "none"})]
+    rows = [row(made, s, made[0].condition.steps, x, 0, "agent") for made, ends in cells for s, x in enumerate(ends)]
+    _, _, *body = against.added_table([*summarise(rows, [made for made, _ in cells]).results.values()]).splitlines()
+    shown = [[text.strip().split(" (")[0] for text in line.strip("|").split("|")] for line in body]
+    assert sorted(line[:3] for line in shown) == [["`bpql`", "+0", "+0"], ["`lifting`", "+0", "**+10"]]
+
+
 def test_equal_critics_are_compared_too() -> None:
     """Any-age without layer normalisation stands beside agents without it, and not beside those with it."""
     five = [1.0, 2, 3, 4, 5]
