@@ -32,6 +32,7 @@ from delayrl.agents.registry import AGENTS
 from delayrl.cli.main import main as delayrl
 from delayrl.envs.making import make
 from delayrl.play.policy import spec_of
+from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
 from delayrl.report.statistics import Stratum, area, common_steps, stratified_bootstrap
 from delayrl.report.wording import gradient_steps
@@ -39,14 +40,7 @@ from delayrl.run.condition import resolve
 from delayrl.run.cost import Cost
 from delayrl.training.cost import cost_of
 
-COLOURS = {
-    "vdpo": "#1f6feb",
-    "vdpo reference": "#8c8c8c",
-    "sac-memoryless": "#d1242f",
-    "bpql": "#1a7f37",
-    "a-sac": "#9a6700",
-    "any-age": "#8250df",
-}
+COLOURS = {agent: style[0] for agent, style in STYLES.items()} | {"vdpo reference": STYLES["sac"][0]}
 
 DETAILS = ("speed-floors", "speed-operations")
 """Sections about speed for those who work on it, in speed/README.md."""
@@ -301,7 +295,7 @@ def main() -> None:
     usual, every = (HERE / "results" / f"halfcheetah-ages{name}.jsonl" for name in ("", "-any"))
     title, wide = "HalfCheetah-v5, trained under uniform:1:25, five seeds", "any-age second_age=any"
     played = sweeps.read(usual) | {wide: sweeps.read(every)["any-age"]}
-    sweeps.draw(played, title, images / "ages.png", COLOURS | {wide: "#1b7f79"})
+    sweeps.draw(played, title, images / "ages.png", COLOURS | {wide: STYLES["any-age"][1]})
     for name, file in {"ages": usual, "ages-any": every}.items():
         insert(root / "docs" / "algorithms" / "any-age.md", name, sweeps.section(file, "any-age"))
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]

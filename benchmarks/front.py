@@ -11,6 +11,7 @@ from matplotlib import pyplot
 from which import BUDGET, ended, results_of
 
 from delayrl.bench.results import Collected
+from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.wording import interval, normalised
@@ -33,18 +34,19 @@ SEEDS = 5
 OLDER = {"01b5aa23787f", "306d0e2c45c5", "3ee61c16dc1c", "6441e5f11602", "730fe4a4960b", "752d29b5f225", "e50179b9d693"}
 """Commits from before the mistake of docs/benchmarks.md, "A mistake in older rows", was fixed."""
 COLOURS = {
-    "`sac`, no delay": "#8c8c8c",
-    "`sac`, no delay, `critic_norm=layer`": "#c4c4c4",
-    "`any-age`": "#8250df",
-    "`any-age`, `forecast_error=distance`": "#d2a8ff",
-    "`vdpo` †": "#1f6feb",
-    "`lifting`": "#bc4c00",
-    "`bpql`": "#1a7f37",
-    "`bpql`, `critic_norm=layer`": "#6fdd8b",
-    "`a-sac`": "#d4a72c",
-    "`dcac`": "#0a7ea4",
-    "`sac-memoryless`": "#d1242f",
+    "`sac`, no delay": STYLES["sac"][0],
+    "`sac`, no delay, `critic_norm=layer`": STYLES["random"][0],
+    "`any-age`": STYLES["any-age"][0],
+    "`any-age`, `forecast_error=distance`": STYLES["any-age"][1],
+    "`vdpo` †": STYLES["vdpo"][0],
+    "`lifting`": STYLES["lifting"][0],
+    "`bpql`": STYLES["bpql"][0],
+    "`bpql`, `critic_norm=layer`": STYLES["bpql"][1],
+    "`a-sac`": STYLES["a-sac"][0],
+    "`dcac`": STYLES["dcac"][0],
+    "`sac-memoryless`": STYLES["sac-memoryless"][0],
 }
+"""Agents have the colours of reports, and one variant the lighter of both."""
 
 
 def section(files: list[Path], pictures: Path) -> str:
@@ -59,7 +61,7 @@ def section(files: list[Path], pictures: Path) -> str:
     steps = f"{', '.join(others)} and {last}"
     made = (
         f"Δ is the delay in steps. Preset `matched`, {steps}, `--precision bfloat16`; {SEEDS} seeds where no other "
-        "number is given. In brackets is the 95 % interval of the normalised return, below it the raw return at the "
+        "number is given. Below each normalised return stands its 95 % interval, then the raw return at the "
         "end ± the standard deviation over seeds; a seed's return is a mean of ten episodes. † acts on the true state "
         "while it trains. ° has rows from before a mistake was fixed, of which more below. VDPO has `--tokens 1280`. "
         "Any-age's critics have layer normalisation, and with `critic_norm=layer` those of SAC and BPQL; those of "
@@ -94,8 +96,8 @@ def older(tables: list[Collected]) -> set[tuple[str, Case]]:
 
 
 def short(env: str) -> str:
-    """Return the task without who registers it."""
-    return env.removeprefix("delayrl/")
+    """Return the task without who registers it and its version."""
+    return env.removeprefix("delayrl/").rpartition("-v")[0]
 
 
 def name(result: Result) -> str:
@@ -116,7 +118,7 @@ def table(chosen: Chosen, marked: Collection[tuple[str, Case]] = ()) -> str:
         known = [arm for arm in (label, label.partition(",")[0]) if (arm, CASES[1]) in chosen]
         return -chosen[known[0], CASES[1]].curves.final.mean() if known else np.inf, label
 
-    head = ["", *(f"{env}, Δ = {delay}" for env, delay in CASES)]
+    head = ["", *(f"{short(env)}, Δ = {delay}" for env, delay in CASES)]
     labels = sorted(dict.fromkeys(label for label, _ in chosen), key=rank)
     places = [[(label, case) for case in CASES] for label in labels]
     cells = [[cell(chosen.get(place), " °" if place in marked else "") for place in row] for row in places]
@@ -124,13 +126,13 @@ def table(chosen: Chosen, marked: Collection[tuple[str, Case]] = ()) -> str:
 
 
 def cell(result: Result | None, mark: str = "") -> str:
-    """Write a normalised return with its mark and interval, and the raw one below; nothing for what has not run."""
+    """Write in lines a normalised return with its mark, its interval and the raw one; nothing for what has not run."""
     if result is None:
         return ""
     final, within = result.curves.final, interval(result.final_interval, normalised)
     seeds = f"; {result.runs} seeds" if result.runs != SEEDS else ""
     raw = spread(final) if abs(final.mean()) > 999 else f"{final.mean():.1f} ± {final.std(ddof=1):.1f}"
-    return f"**{normalised(result.final.mean())}**{mark}" + (f" ({within}{seeds})" if within else "") + f"<br>{raw}"
+    return "<br>".join([f"**{normalised(result.final.mean())}**{mark}", *([within + seeds] if within else []), raw])
 
 
 def draw(chosen: Chosen, out: Path) -> None:

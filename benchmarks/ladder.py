@@ -15,7 +15,6 @@ import jsonl
 import numpy as np
 from learning.curves import curve, difference, spread
 from matplotlib import pyplot
-from matplotlib.colors import to_hex
 from scipy import stats
 
 from delayrl.bench import results as bench
@@ -199,13 +198,17 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
 
 
 def draw(arms: list[Result], out: Path) -> None:
-    """Draw the curves of the arms in one picture."""
-    figure, axes = pyplot.subplots(figsize=(8, 6), layout="constrained")
-    colours = [to_hex(pyplot.get_cmap("tab20")(number)) for number in range(20)]
-    for result, colour in zip(arms, itertools.cycle(colours)):
-        curve(axes, *result.curves, colour).set_label(name(result).replace("`", ""))
-    axes.set_title("HalfCheetah-v5, 25 steps late unless said")
-    axes.set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    figure.savefig(out, dpi=130)
+    """Draw the mean curves of the arms: a panel for any-age and its variants, one for BPQL's, with SAC in both."""
+    figure, panels = pyplot.subplots(1, 2, figsize=(10, 5.6), sharey=True, layout="constrained")
+    for axes, title in zip(panels, ("any-age and its arms", "BPQL and its arms"), strict=True):
+        sac = [arm for arm in arms if arm.condition.agent == "sac"]
+        own = [arm for arm in arms if arm not in sac and ("bpql" in name(arm)) == title.startswith("BPQL")]
+        greys, tab = itertools.cycle(("#333333", "#999999")), itertools.cycle(pyplot.get_cmap("tab10").colors)
+        looks = [*zip(sac, greys, strict=False), *zip(own, tab, strict=False)]
+        for result, colour in looks:
+            curve(axes, *result.curves, colour, each=False).set_label(name(result).replace("`", ""))
+        axes.set_title(f"{title}, 25 steps late", fontsize=10)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize=8)
+    panels[0].set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
+    figure.savefig(out, dpi=110)
     pyplot.close(figure)

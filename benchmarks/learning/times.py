@@ -1,6 +1,5 @@
 """Tables and the picture of returns against wall-clock, from the rows of timed.py."""
 
-import itertools
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -9,13 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import pyplot
 
+from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
 
 RETURNS = (1_000, 2_000, 3_000)
 OURS = "`any-age`, `small`"
 NAMES = {"sb3": "SAC of Stable-Baselines3", "sbx": "SAC of SBX", "released": "VDPO, released code"}
 TICKS = (0.1, 0.3, 1, 3, 10, 30)
-COLOURS = ("#1f6feb", "#1a7f37", "#8250df", "#c07ff0", "#9a6700", "#d1242f", "#8c8c8c")
+COLOURS = {"SAC of Stable-Baselines3": "#8d5524", "SAC of SBX": "#d39b6a", "VDPO, released code": STYLES["vdpo"][1]}
+"""Agents of ours have the colours of reports."""
 
 
 class Run(NamedTuple):
@@ -134,7 +135,8 @@ def draw(runs: Runs, out: Path) -> None:
     figure, panels = pyplot.subplots(1, len(runs), figsize=(5 * len(runs), 4.2), layout="constrained", squeeze=False)
     sides = sorted({side for own in runs.values() for side in own})
     for axes, (delay, own) in zip(panels[0], sorted(runs.items()), strict=True):
-        for side, colour in zip(sides, itertools.cycle(COLOURS), strict=False):
+        for side in sides:
+            colour = COLOURS.get(side) or STYLES[side.split("`")[1]][0]
             for i, run in enumerate(own.get(side, [])):
                 label = side.replace("`", "") if i == 0 else None
                 axes.plot(np.array(run.seconds) / 60, run.returns, color=colour, linewidth=1.4, label=label)

@@ -22,14 +22,14 @@ STYLES = {
     "dida": ("#a3307a", "#e888c4", "8 3"),
     "dcac": ("#9a8400", "#d8c64c", "2 2"),
     "a-sac": ("#1d93b8", "#62cdf0", "6 2 2 2"),
-    "any-age": ("#00796b", "#4fc3b4", ""),
+    "any-age": ("#7b3fc4", "#b98cff", ""),
     "lifting": ("#c65d00", "#ffa25c", "10 3"),
     "sac-memoryless": ("#777777", "#a0a0a0", "4 3"),
     "sac": ("#333333", "#dddddd", "6 3"),
     "random": ("#999999", "#777777", "1 3"),
 }
 """Colours on light and on dark ground, and dashes: told apart with any colour vision, and in black and white."""
-SPARE = (("#5b4bb7", "#a99cff"), ("#37474f", "#cfd8dc"), ("#8d5524", "#d39b6a"), ("#546e7a", "#9fb6c1"))
+SPARE = (("#00796b", "#4fc3b4"), ("#37474f", "#cfd8dc"), ("#8d5524", "#d39b6a"), ("#546e7a", "#9fb6c1"))
 Look = tuple[str, str, str, str]  # name, then a style
 SAC: Look = ("delay-free SAC", *STYLES["sac"])
 RANDOM: Look = ("random", *STYLES["random"])
