@@ -255,7 +255,7 @@ def draw_sizes(rows: list[Row], out: Path) -> None:
             axes.spines[side].set_visible(False)
     every[0].yaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
     every[0].yaxis.set_major_formatter(matplotlib.ticker.ScalarFormatter())
-    every[0].set_ylabel("ms of all cores, a step of a seed")
+    every[0].set_ylabel("processor ms / cores, a step of a seed")
     if every[1].lines:
         every[1].legend(frameon=False)
     figure.savefig(out, dpi=140)
