@@ -25,7 +25,8 @@ def markdown(summary: Summary, title: str, pictures: Pictures, description: str 
         _escape(description),
         f"{wording.states(summary)}. {legend} {wording.paper(summary)}".strip(),
     ]
-    parts += [_escape(line) for line in (*wording.remarks(summary), *wording.made_with(summary.versions))]
+    parts.append("\n".join(f"- {_escape(line)}" for line in wording.remarks(summary)))
+    parts.append("[report.html](report.html), in the same folder, has these tables with sorting and filters.")
     for setting in summary.settings:
         results = [r for r in summary.results.values() if r.place.setting == setting]
         protocol, preset = _escape(setting.protocol), _escape(setting.preset)
@@ -50,6 +51,8 @@ def markdown(summary: Summary, title: str, pictures: Pictures, description: str 
             body = [[_escape(text) for text in line] for line in costs]
             parts += ["### Cost of an agent", wording.COST_CAPTION, markdown_table(wording.COST_HEAD, body)]
         parts += ["### Anchors", _anchors(results), "### All results", _results(summary, results)]
+    if made := wording.made_with(summary.versions):
+        parts += ["## Versions", *map(_escape, made)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
