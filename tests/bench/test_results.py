@@ -261,6 +261,15 @@ def test_a_damaged_table_replaces_nothing(finished, tmp_path: Path, query: str) 
     assert not out.exists()
 
 
+@pytest.mark.parametrize("step", ["'x'", "NULL"])
+def test_a_damaged_step_is_compared_with_none(finished, tmp_path: Path, step: str) -> None:
+    """Of a cell with as many rows elsewhere, the steps decide."""
+    grid, runs = finished
+    collect(grid, runs, tmp_path / "t.sqlite")
+    with pytest.raises(delayrl.DelayRLError, match=r"changed-t\.sqlite is no table of results, or damaged: "):
+        collect(grid, runs, changed(tmp_path / "t.sqlite", f"UPDATE cells SET step = {step}"))
+
+
 def test_only_one_collects_into_a_folder(finished, tmp_path: Path) -> None:
     grid, runs = finished
     with lock(tmp_path), pytest.raises(delayrl.DelayRLError, match="another program is collecting into"):

@@ -97,16 +97,16 @@ def collect(grid: Grid, runs: Path, out: Path, others: Sequence[Path] = ()) -> i
         with lock(out.parent) as free:
             if not free:
                 raise DelayRLError(f"another program is collecting into {out.parent}; try again when it has ended")
-            held = _held_elsewhere(grid, out, others)
+            elsewhere = _held_elsewhere(grid, out, others)
             with draft(out, shared=True) as file, contextlib.closing(sqlite3.connect(file)) as table:
-                return _fill(table, grid, runs, held)
+                return _fill(table, grid, runs, elsewhere)
     except (OSError, sqlite3.OperationalError) as error:
         raise DelayRLError(f"cannot write {out}: {error}") from error
 
 
-def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path, dict[str, Held]]:
-    """Return what the tables hold of each cell of the grid: the one that is there already, and others."""
-    ids, held = {cell.id for cell in grid.cells}, {}
+def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[str, tuple[Held, Path]]:
+    """Return which of the tables, the one that is there already and others, holds most of each cell of the grid."""
+    ids, most = set(grid.ids), dict[str, tuple[Held, Path]]()
     for file in (*([out] if out.exists() else []), *others):
         with _open(file) as table:
             name = table.execute("SELECT value FROM meta WHERE key = 'grid'").fetchone()[0]
@@ -114,7 +114,7 @@ def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path,
                 "SELECT cells.id, COUNT(rows.run), cells.state = 'done', cells.step FROM cells "
                 "LEFT JOIN runs ON runs.cell = cells.id LEFT JOIN rows ON rows.run = runs.id GROUP BY cells.id"
             )
-            known = {id: Held(rows, bool(done), step) for id, rows, done, step in cells}
+            known = {id: Held(rows, bool(done), int(step)) for id, rows, done, step in cells}
         if file == out and name != grid.name:
             raise DelayRLError(f"{out} is the table of the grid {name!r}; give another --out")
         gone = sorted(id for id, of in known.items() if of.rows and id not in ids)
@@ -123,15 +123,17 @@ def _held_elsewhere(grid: Grid, out: Path, others: Sequence[Path]) -> dict[Path,
             words += ", …)" if gone[3:] else ")"
             kept = f", and --also {out} for the cells that it still has" if ids & known.keys() else ""
             raise DelayRLError(f"{words}; give another --out{kept}")
-        held[file] = {id: known[id] for id in ids & known.keys()}
-        if not held[file]:
+        if not ids & known.keys():
             whose = "an earlier version of it" if name == grid.name else f"{name!r}"
             raise DelayRLError(f"{file} has no cell of {grid.name}: it is the table of {whose}")
-    return held
+        for id in ids & known.keys():
+            if id not in most or known[id] > most[id][0]:
+                most[id] = known[id], file
+    return most
 
 
-def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path, Mapping[str, Held]]) -> int:
-    """Write the tables. `held` says what other tables hold of each cell. Returns the number of rows."""
+def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, elsewhere: Mapping[str, tuple[Held, Path]]) -> int:
+    """Write the tables. `elsewhere` says which other table holds most of each cell. Returns the number of rows."""
     table.executescript("PRAGMA page_size = 4096; PRAGMA journal_mode = OFF;" + TABLES)
     meta = {"schema": str(SCHEMA), "grid": grid.name, "description": grid.description}
     table.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
@@ -141,11 +143,10 @@ def _fill(table: sqlite3.Connection, grid: Grid, runs: Path, held: Mapping[Path,
         paths = zip(folders.seed_paths(runs / cell.folder, cell.seeds), cell.seeds, strict=True)
         found = [(path, seed, _own_rows(cell, path)) for path, seed in paths]
         here = Held(sum(len(rows) for *_, rows in found), p.state == "done", p.step)
-        elsewhere = max(held, key=lambda file: held[file].get(cell.id, Held()), default=None)
-        best = held[elsewhere].get(cell.id, Held()) if elsewhere else Held()
+        there, file = elsewhere.get(cell.id, (Held(), None))
         begun = (runs / cell.folder).is_dir()
-        if elsewhere and (best[:2] > here[:2] or (best > here and not begun)):
-            total += _copy_cell(table, elsewhere, cell, number)
+        if file and (there[:2] > here[:2] or (there > here and not begun)):
+            total += _copy_cell(table, file, cell, number)
             continue
         if is_damaged(cell, runs, p):
             raise DelayRLError(p.line)

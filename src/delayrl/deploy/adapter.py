@@ -162,24 +162,24 @@ def export_layers(
     policy, (delayed, augmented) = adapt(function, env), _layers_of(env)
     if augmented is None:
         raise DelayRLError("a bundle takes a policy that was trained on AugmentedObservation")
-    half = np.asarray(policy.high, np.float64)
-    if not np.allclose(policy.low, -half, rtol=1e-6):
+    if not np.allclose(policy.low, -policy.high, rtol=1e-6):
         raise DelayRLError("a bundle takes actions with a range around 0: train with RescaleAction inside Delayed")
-    (first, bias), *rest = _numbers(layers)
-    sizes, delta = policy.obs_size, policy.max_age
-    shown: Any = augmented.observation_space.shape
-    if len(first) != shown[0]:
-        raise DelayRLError(f"the first layer must take the vector of size {shown[0]}; its weights are {first.shape}")
-    first = first.copy()
-    first[sizes : sizes + delta * len(half)] *= np.tile(half, delta)[:, None]  # a bundle's network reads -1 .. 1
+    pairs = _numbers(layers)
+    first, size, delta = pairs[0][0], policy.obs_size, policy.max_age
+    (shown,) = augmented.observation_space.shape
+    if len(first) != shown:
+        raise DelayRLError(f"the first layer must take the vector of size {shown}; its weights are {first.shape}")
+    scaled = first[size : size + delta * policy.action_size]
+    scaled *= np.tile(policy.high, delta)[:, None]  # a bundle's network reads actions in -1 .. 1
     arrays = {
         f"head.{i}.{name}": np.ascontiguousarray(array, np.float32)
-        for i, layer in enumerate([(first, bias), *rest])
-        for name, array in zip("wb", layer, strict=True)
+        for i, pair in enumerate(pairs)
+        for name, array in zip("wb", pair, strict=True)
     }
-    hidden = tuple(len(b) for _, b in [(first, bias), *rest][:-1])
-    low, high = (tuple(np.asarray(bound, np.float32).tolist()) for bound in (policy.low, policy.high))
-    network = Network(sizes, len(half), delta, low, high, "augmented" if delta else "observation", hidden)
+    hidden = tuple(len(b) for _, b in pairs[:-1])
+    low, high = tuple(policy.low.tolist()), tuple(policy.high.tolist())
+    kind = "augmented" if delta else "observation"
+    network = Network(size, policy.action_size, delta, low, high, kind, hidden)
     network.check(arrays)
     what = "with ReLU between them and a tanh at the end"
     check_same(network, arrays, policy, f"the layers, {what}, do not compute the policy")
@@ -200,9 +200,9 @@ def export_layers(
 
 
 def _numbers(layers: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return weights and biases as arrays. Raises DelayRLError if they are none of a layer, or there is no layer."""
+    """Return copies of weights and biases as arrays. Raises DelayRLError if there are none, or they are of no layer."""
     try:
-        pairs = [(np.asarray(w, np.float64), np.asarray(b, np.float64)) for w, b in layers]
+        pairs = [(np.array(w, np.float64), np.array(b, np.float64)) for w, b in layers]
     except (TypeError, ValueError):
         pairs = []
     if not pairs or any((w.ndim, b.ndim) != (2, 1) for w, b in pairs):

@@ -77,15 +77,13 @@ def network_of(policy: Policy) -> tuple[Network, Arrays]:
     tree = {"head": mean(parts.head)}
     sizes: dict[str, Any] = {}
     if parts.current is not None:
-        tree["current"] = mean(parts.current)
+        tree["current"], sizes["current"] = mean(parts.current), hidden(parts.current)
     if parts.forecast is not None:
-        kind, tree["forecast"] = "forecast", parts.forecast
+        kind, tree["forecast"], sizes["forecast"] = "forecast", parts.forecast, hidden(parts.forecast)
     if parts.encoder is not None:
         kind, tree["encoder"] = "transformer", parts.encoder
-        sizes = {"width": parts.encoder["position"].shape[1], "blocks": len(parts.encoder["blocks"])}
+        sizes |= {"width": parts.encoder["position"].shape[1], "blocks": len(parts.encoder["blocks"])}
     low, high = tuple(policy.low.tolist()), tuple(policy.high.tolist())
-    current, forecast = (None if part is None else hidden(part) for part in (parts.current, parts.forecast))
-    sizes |= {"current": current, "forecast": forecast}
     network = Network(spec.obs_size, size, spec.delay, low, high, kind, hidden(parts.head), **sizes)
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in flatten_tree(tree).items()}
     network.check(arrays)

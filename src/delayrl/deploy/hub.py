@@ -14,6 +14,38 @@ LONGEST_MESSAGE = 200
 """Characters that are shown of what a server says."""
 
 
+CARD_TEXT = """\
+---
+library_name: "delayrl"
+pipeline_tag: "reinforcement-learning"
+tags: {tags}
+---
+
+# {agent} on {env}, delay {delay}
+
+A policy for observations that arrive late: it takes the newest observation that has arrived, its age in steps, and \
+the actions applied since.
+
+| | |
+| --- | --- |
+{table}
+
+The return is raw, of the last evaluation of one training run under its protocol.
+
+```
+pip install 'delayrl[hub]'
+delayrl pull {repo} --out bundle
+```
+
+```python
+from delayrl.deploy import load_bundle
+
+policy = load_bundle("bundle")  # reads weights and JSON, and runs no code of the bundle
+action = policy(obs, actions, age)
+```
+"""
+
+
 def push(bundle: str | Path, repo: str, *, private: bool = False) -> str:
     """Upload a bundle and a model card made from its metadata, as one commit; return the address of the repository.
 
@@ -79,26 +111,21 @@ def card(metadata: Mapping[str, Any], repo: str) -> str:
     """Return the model card: the metadata as a table, and how to use the bundle."""
     policy, evaluation = metadata["policy"], metadata.get("evaluation")
     agent, env, delay = (plain(metadata.get(name)) for name in ("agent", "env", "delay"))
-    head: dict[str, Any] = {"library_name": "delayrl", "pipeline_tag": "reinforcement-learning"}
-    head["tags"] = ["reinforcement-learning", "delay", "delayrl", agent, env]
-    about = "A policy for observations that arrive late: it takes the newest observation that has arrived, its age"
-    lines = [f"# {agent} on {env}, delay {delay}", "", f"{about} in steps, and the actions applied since."]
-    lines += ["", "| | |", "| --- | --- |", f"| observation | {policy['obs_size']} numbers |"]
-    lines += [f"| action | {policy['action_size']} numbers |", f"| ages | 0 .. {policy['max_age']} |"]
-    lines += [f"| {name} | {plain(metadata.get(name))} |" for name in ("dt", "preset", "protocol", "seed", "step")]
+    cells = {
+        "observation": f"{policy['obs_size']} numbers",
+        "action": f"{policy['action_size']} numbers",
+        "ages": f"0 .. {policy['max_age']}",
+        **{name: plain(metadata.get(name)) for name in ("dt", "preset", "protocol", "seed", "step")},
+    }
     if isinstance(evaluation, Mapping):
         names = ("mean_return", "std_return", "episodes", "step")
         mean, spread, count, step = (plain(evaluation.get(name)) for name in names)
         around = "" if evaluation.get("std_return") is None else f" ± {spread}"
-        lines += [f"| return | {mean}{around} (mean ± standard deviation of {count} episodes, at step {step}) |"]
-    lines += [f"| checksum | {plain(metadata['checksum'])} |", ""]
-    lines += ["The return is raw, of the last evaluation of one training run under its protocol.", ""]
-    lines += ["```", "pip install 'delayrl[hub]'", f"delayrl pull {repo} --out bundle", "```", ""]
-    lines += ["```python", "from delayrl.deploy import load_bundle", ""]
-    lines += ['policy = load_bundle("bundle")  # reads weights and JSON, and runs no code of the bundle']
-    lines += ["action = policy(obs, actions, age)", "```", ""]
-    yaml = [f"{name}: {json.dumps(value)}" for name, value in head.items()]  # JSON is YAML
-    return "\n".join(["---", *yaml, "---", "", *lines])
+        cells["return"] = f"{mean}{around} (mean ± standard deviation of {count} episodes, at step {step})"
+    cells["checksum"] = plain(metadata["checksum"])
+    table = "\n".join(f"| {name} | {value} |" for name, value in cells.items())
+    tags = json.dumps(["reinforcement-learning", "delay", "delayrl", agent, env])  # JSON is YAML
+    return CARD_TEXT.format(agent=agent, env=env, delay=delay, table=table, tags=tags, repo=repo)
 
 
 def plain(value: Any) -> str:

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from delayrl.report import statistics
-from delayrl.report.results import Result, Setting, agent_order, delay_order, make_strata
+from delayrl.report.results import Result, Setting, agent_order, ended_by_delay, make_strata
 from delayrl.report.statistics import NAN
 
 
@@ -46,16 +46,10 @@ class Comparison(NamedTuple):
 
 def make_comparisons(results: Iterable[Result]) -> list[Comparison]:
     """Compare each two learners, by their seeds that have ended, in the order of their labels."""
-    ended: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
-    for result in results:
-        if not result.is_anchor and not result.partial and result.runs:
-            ended[result.place.setting, result.place.delay].append(result)
-            if isinstance(result.place.delay, int):
-                ended[result.place.setting, None].append(result)
     comparisons = []
-    for setting, delay in sorted(ended, key=lambda key: (key[0], delay_order(key[1]))):
+    for (setting, delay), ended in ended_by_delay(results).items():
         at: dict[str, dict[object, Result]] = defaultdict(dict)
-        for result in ended[setting, delay]:
+        for result in ended:
             at[result.place.label][result.place.env, result.place.delay, result.condition.steps] = result
         for one, other in combinations(sorted(at, key=agent_order), 2):
             pairs = [(result, at[other][key]) for key, result in at[one].items() if key in at[other]]

@@ -4,7 +4,6 @@ import html
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from delayrl.errors import count
 from delayrl.report import wording
 from delayrl.report.comparisons import Comparison
 from delayrl.report.markup import markdown_table
@@ -87,7 +86,7 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
                 line.append("")
                 continue
             interval = wording.interval((a.low, a.high), wording.normalised)
-            counts = GREY.format(f"{wording.tasks(a.tasks, delay)}, {count(a.runs, 'run')}")
+            counts = GREY.format(wording.aggregate_counts(a))
             line.append("<br>".join(filter(None, (f"**{a.iqm:.2f}**", interval, counts))))
         body.append(line)
     return markdown_table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
@@ -135,17 +134,5 @@ def _results(summary: Summary, results: Iterable[Result]) -> str:
         first = "×" if r.missed else wording.steps(r.steps_to_threshold)
         reached = "<br>".join(filter(None, (first, wording.interval(r.steps_interval, wording.steps))))
         body.append((*names, raw, final, area, reached, seeds, f"{r.condition.steps:,}", wording.hours(r.hours), state))
-    heads = (
-        "Task",
-        "Δ",
-        "Agent",
-        "Return",
-        "Normalised",
-        "Area",
-        "Steps to Ret_df",
-        "Seeds",
-        "Steps",
-        "Hours",
-        "State",
-    )
+    heads = "Task", "Δ", "Agent", "Return", "Normalised", "Area", "Steps to Ret_df", "Seeds", "Steps", "Hours", "State"
     return f"{wording.CELLS_CAPTION}\n\n{markdown_table(heads, body)}"

@@ -143,16 +143,23 @@ def _table(table: Table, names: Names) -> dict[str, Any]:
 
 
 def _comparison(c: Comparison, names: Names) -> dict[str, Any]:
-    delay = None if c.delay is None else names["delays"].index(c.delay)
-    place = {"setting": names["settings"].index(c.setting), "delay": delay}
-    agents = {"one": names["agents"].index(c.one), "other": names["agents"].index(c.other)}
-    return (
-        place | agents | {"sort": _rounded(c.probability.value), "clear": c.clear, "texts": wording.comparison_texts(c)}
-    )
+    return {
+        "setting": names["settings"].index(c.setting),
+        "delay": None if c.delay is None else names["delays"].index(c.delay),
+        "one": names["agents"].index(c.one),
+        "other": names["agents"].index(c.other),
+        "sort": _rounded(c.probability.value),
+        "clear": c.clear,
+        "texts": wording.comparison_texts(c),
+    }
 
 
 def _aggregate(a: Aggregate, names: Names) -> dict[str, Any]:
-    delay = None if a.delay is None else names["delays"].index(a.delay)
-    place = {"setting": names["settings"].index(a.setting), "delay": delay, "agent": names["agents"].index(a.label)}
-    iqm, profile = _rounded([a.iqm, a.low, a.high]), _rounded([a.profile, a.profile_low, a.profile_high], 5)
-    return place | {"iqm": iqm, "tasks": a.tasks, "runs": a.runs, "profile": profile}
+    return {
+        "setting": names["settings"].index(a.setting),
+        "delay": None if a.delay is None else names["delays"].index(a.delay),
+        "agent": names["agents"].index(a.label),
+        "iqm": _rounded([a.iqm, a.low, a.high]),
+        "counts": wording.aggregate_counts(a),
+        "profile": _rounded([a.profile, a.profile_low, a.profile_high], 5),
+    }

@@ -213,6 +213,19 @@ def make_results(
     return {result.place: _anchored(result, results) for result in sorted(results, key=_order)}
 
 
+def ended_by_delay(results: Iterable[Result]) -> dict[tuple[Setting, int | str | None], list[Result]]:
+    """Group learners whose seeds have ended by setting and delay, in order; under None, those of all constant ones."""
+    groups: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
+    for result in results:
+        if result.is_anchor or result.partial or not result.runs:
+            continue
+        setting, delay = result.place.setting, result.place.delay
+        groups[setting, delay].append(result)
+        if isinstance(delay, int):
+            groups[setting, None].append(result)
+    return {key: groups[key] for key in sorted(groups, key=lambda key: (key[0], delay_order(key[1])))}
+
+
 def _order(result: Result) -> tuple[Any, ...]:
     place = result.place
     return place.setting, place.env, delay_order(place.delay), agent_order(place.label)
@@ -273,21 +286,20 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
     """
     setting, env = result.place.setting, result.place.env
     near = [o for o in others if o.place.setting.protocol == setting.protocol and o.place.env == env and o.runs]
-    random = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
+    randoms = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
     ended = [o for o in near if o.place.setting == setting and not o.partial and FROM not in o.condition.overrides]
     plain = [o for o in ended if o.condition.agent == "sac" and o.place.delay == 0]
     same = [o for o in plain if o.condition.steps == result.condition.steps]
     longer = [o for o in plain if o.condition.steps > result.condition.steps]
-    random_anchor = reference_anchor = threshold_anchor = NO_ANCHOR
-    if random:  # it does not learn, so that all its evaluations are alike
-        best = min(random, key=lambda o: (o.partial, -o.runs, o.place.setting != setting, _fewest_overrides(o)))
-        random_anchor = Anchor(best.curves.returns.mean(1), best.smoothed[:, -1], "random")
+    random = reference = threshold = NO_ANCHOR
+    if randoms:  # it does not learn, so that all its evaluations are alike
+        best = min(randoms, key=lambda o: (o.partial, -o.runs, o.place.setting != setting, _fewest_overrides(o)))
+        random = Anchor(best.curves.returns.mean(1), best.smoothed[:, -1], "random")
     if same:
-        reference_anchor = threshold_anchor = _reference(min(same, key=_fewest_overrides))
+        reference = threshold = _reference(min(same, key=_fewest_overrides))
     elif longer:
-        threshold_anchor = _reference(min(longer, key=_longest))
-    result = replace(result, random_anchor=random_anchor, reference_anchor=reference_anchor)
-    return replace(result, threshold_anchor=threshold_anchor)
+        threshold = _reference(min(longer, key=_longest))
+    return replace(result, random_anchor=random, reference_anchor=reference, threshold_anchor=threshold)
 
 
 def _reference(result: Result) -> Anchor:

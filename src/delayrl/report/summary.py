@@ -11,7 +11,7 @@ from delayrl.errors import DelayRLError
 from delayrl.report import statistics
 from delayrl.report.comparisons import Comparison, make_comparisons
 from delayrl.report.configurations import by_key, distinct_overrides
-from delayrl.report.results import Place, Result, Setting, agent_order, delay_order, make_results, make_strata
+from delayrl.report.results import Place, Result, Setting, agent_order, ended_by_delay, make_results, make_strata
 from delayrl.report.rows import RowGroup, group_rows
 from delayrl.report.statistics import Floats
 from delayrl.report.tables import Table, make_tables
@@ -188,25 +188,22 @@ def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
     Only agents with the same tasks can be compared: an agent that lacks a task of another's is left out, and one that
     is then alone too.
     """
-    chosen: dict[tuple[Setting, int | str | None], dict[str, list[Result]]] = defaultdict(lambda: defaultdict(list))
-    for result in results:
-        place = result.place
-        if result.is_anchor or result.partial or not result.runs or np.isnan(result.final).any():
-            continue
-        for delay in (place.delay, None) if isinstance(place.delay, int) else (place.delay,):
-            chosen[place.setting, delay][place.label].append(result)
+    normalised = [result for result in results if not np.isnan(result.final).any()]
     aggregates = []
-    for (setting, delay), results_of in chosen.items():
+    for (setting, delay), ended in ended_by_delay(normalised).items():
+        results_of: dict[str, list[Result]] = defaultdict(list)
+        for result in ended:
+            results_of[result.place.label].append(result)
         tasks_of = {
             label: {(r.place.env, r.place.delay, r.condition.steps) for r in own} for label, own in results_of.items()
         }
         every = set().union(*tasks_of.values())
         if delay is None and len({constant for _, constant, _ in every}) == 1:
             continue  # the same as at this delay
-        whole = [label for label, tasks in tasks_of.items() if tasks == every]
+        whole = sorted((label for label, tasks in tasks_of.items() if tasks == every), key=agent_order)
         if len(whole) > 1 or len(results_of) == 1:
             aggregates += [_aggregate(setting, delay, label, results_of[label]) for label in whole]
-    return sorted(aggregates, key=lambda a: (a.setting, delay_order(a.delay), agent_order(a.label)))
+    return aggregates
 
 
 def _aggregate(setting: Setting, delay: int | str | None, label: str, results: list[Result]) -> Aggregate:

@@ -10,7 +10,7 @@ from delayrl.errors import count
 from delayrl.report.comparisons import Comparison
 from delayrl.report.results import Anchor, Result, Setting, agent_order
 from delayrl.report.statistics import FEWEST, SMOOTHED, mean_std
-from delayrl.report.summary import Summary
+from delayrl.report.summary import Aggregate, Summary
 from delayrl.report.tables import Table, TableEntry
 from delayrl.run.cell import CellState
 from delayrl.run.cost import Cost
@@ -142,6 +142,11 @@ def comparison_texts(comparison: Comparison) -> tuple[str, str, str, str]:
     return normalised(p.value), interval((p.low, p.high), normalised), difference, counts
 
 
+def aggregate_counts(a: Aggregate) -> str:
+    """Write what an aggregate rests on."""
+    return f"{tasks(a.tasks, a.delay)}, {count(a.runs, 'run')}"
+
+
 def tasks(number: int, delay: int | str | None) -> str:
     """Write a number of tasks at a delay, or of conditions at all constant ones."""
     return count(number, "condition" if delay is None else "task")
@@ -183,9 +188,9 @@ def costs(summary: Summary, setting: Setting) -> Sequence[tuple[str, ...]]:
         costs = [result.cost for result in known[label] if result.cost]
         steps = " or ".join(dict.fromkeys(gradient_steps(cost) for cost in costs))
         batches = " or ".join(dict.fromkeys(", ".join(dict.fromkeys(map(str, cost.batches))) for cost in costs))
-        sizes = _range([cost.parameters for cost in costs]), _range([cost.flops for cost in costs])
+        parameters, flops = _range([cost.parameters for cost in costs]), _range([cost.flops for cost in costs])
         privileged = "in training" if any(result.privileged for result in known[label]) else "no"
-        lines.append((summary.name(label), privileged, sizes[0], steps, batches, sizes[1]))
+        lines.append((summary.name(label), privileged, parameters, steps, batches, flops))
     return lines
 
 

@@ -65,8 +65,9 @@ class LocalBackend:
 
 def start_worker(folder: Path, device: str | None, core: int | None = None) -> subprocess.Popen[str]:
     """Start a worker process, which Ctrl-C does not reach. Raises DelayRLError if the disk or the system refuses."""
-    options = [*(["--device", device] if device else []), *([] if core is None else ["--core", str(core)])]
-    command = [sys.executable, "-m", "delayrl.bench.worker", str(folder), *options]
+    command = [sys.executable, "-m", "delayrl.bench.worker", str(folder)]
+    command += ["--device", device] if device else []
+    command += [] if core is None else ["--core", str(core)]
     try:
         with open(folder / "worker.log", "w") as log:
             return subprocess.Popen(
