@@ -75,10 +75,12 @@ def run(given: argparse.Namespace) -> None:
 
 def _is_table(grid: str) -> bool:
     """Tell whether the argument is a table. `collect --out` gives it any name, so its first bytes count."""
+    if grid.endswith(".sqlite"):  # if it is none, reading it says what is wrong
+        return True
     if grid in shipped() or not Path(grid).is_file():
-        return grid.endswith(".sqlite")  # reading it says what is wrong
+        return False
     with open(grid, "rb") as file:
-        return file.read(len(SQLITE)) == SQLITE or grid.endswith(".sqlite")
+        return file.read(len(SQLITE)) == SQLITE
 
 
 def _plan(grid: Grid, given: argparse.Namespace) -> None:

@@ -42,7 +42,7 @@ def _row(run: Run) -> dict[str, Any]:
     step = max([int(evaluated), *(int(folder.name) for folder in checkpoint_folders(run.path))])
     last = float(curve.returns[-1].mean()) if evaluated else None
     columns = {name: config.get(name) for name in NAMES} | {"delay": run.delay}
-    return row | columns | {"step": step, "steps": config["schedule"].get("steps", 0), "return": last}
+    return row | columns | {"step": step, "steps": config["schedule"]["steps"], "return": last}
 
 
 def _cells(row: dict[str, Any]) -> list[Any]:

@@ -44,7 +44,8 @@ class Channel:
         if isinstance(self.law, str):
             raise DelayRLError(f"a channel takes a law, not text: write as_delay({self.law!r})")
         if not isinstance(self.law, OURS):
-            object.__setattr__(self, "law", own_law(self.law) if hasattr(self.law, "draw") else Constant(self.law))  # type: ignore[arg-type]
+            law = own_law(self.law) if hasattr(self.law, "draw") else Constant(self.law)  # type: ignore[arg-type]
+            object.__setattr__(self, "law", law)
         if self.rule not in get_args(Rule):
             raise DelayRLError(f"an arrival rule is one of {', '.join(get_args(Rule))}; got {self.rule!r}")
 

@@ -80,12 +80,12 @@ def own_law(law: Any) -> OwnLaw:
         return unnamed
 
 
-def find_law(text: str, stored: Path | None = None) -> OwnLaw | None:
+def find_law(text: str, stored: Path | None) -> OwnLaw | None:
     """Return the law that a text names, or None if the text is not one of a user's law.
 
     Args:
         text: `module:Class`, or the name of an entry point, with arguments in brackets; or `<Class:maximum>`.
-        stored: the run folder that says so. It may name classes of laws, and no code that came with it.
+        stored: the run folder that says so, if one does. It may name classes of laws, and no code that came with it.
 
     Raises:
         DelayRLError: the law cannot be imported or made, or the folder may not name it.

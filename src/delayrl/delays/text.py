@@ -149,9 +149,10 @@ class DelayParser:
             case "gilbert":
                 readers = self.steps, self.steps, self.probability, self.probability
                 return laws.gilbert_elliott(*self.values(rest, *readers))
+            case "walk" if ":" in rest:
+                return laws.random_walk(*self.values(rest, self.steps, self.probability))
             case "walk":
-                both = self.steps, self.probability
-                return laws.random_walk(*self.values(rest, *(both if ":" in rest else both[:1])))
+                return laws.random_walk(self.steps(rest))
             case "markov":
                 states, table = self.values(rest, str, str)
                 rows = tuple(tuple(map(self.probability, row.split(","))) for row in table.split("/"))

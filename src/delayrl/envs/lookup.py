@@ -43,8 +43,8 @@ def find_maker(name: str) -> Any:
     refuse_instance(found)
     if callable(found):
         return found
-    if with_version(path) in gym.registry:
-        return with_version(path)
+    if (registered := with_version(path)) in gym.registry:
+        return registered
     known = [name for name, value in vars(module).items() if callable(value)]
     near = difflib.get_close_matches(path, [*known, *gym.registry], n=3, cutoff=0.5)
     line = f"module {source!r} has no class or function {path!r}, and registers no such task"

@@ -75,7 +75,8 @@ def register() -> None:
     for task in TASKS:
         pusher = task == "Pusher"
         origin = gym.registry["Pusher-v5" if pusher else f"{task}-v4"]
-        physics = [wrapper("envs.paper", name) for name in ["MuJoCo2", "RewardBeforeStep"][: 1 + pusher]]
+        names = ["MuJoCo2", "RewardBeforeStep"] if pusher else ["MuJoCo2"]
+        physics = [wrapper("envs.paper", name) for name in names]
         noise = wrapper("wrappers.noise", "NoisyActions", probability=NOISE)
         for name, additional in ((task, physics), (f"Noisy{task}", [*physics, noise])):
             add(

@@ -68,9 +68,7 @@ def moving_base(model: Any) -> int | None:
 
 def render(env: Any) -> Picture:
     """Render a frame of an environment beside which others may be rendered too. Raises DelayRLError if it is none."""
-    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
-    if renderer is not None and renderer.viewer is not None:
-        renderer.viewer.make_context_current()  # OpenGL draws into the last one that was
+    _current_viewer(env)  # OpenGL draws into the last one that was
     picture = np.asarray(env.render())
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape) < 2:
         alone = picture.dtype == object and picture.ndim == 0
@@ -87,11 +85,17 @@ def close(env: Any) -> None:
     MuJoCo's part of it must go while its context is current. Later it would delete pictures of other environments, or
     print an exception when the process ends.
     """
-    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
-    if renderer is not None and renderer.viewer is not None:
-        renderer.viewer.make_context_current()
-        renderer.viewer.con.free()
+    if (viewer := _current_viewer(env)) is not None:
+        viewer.con.free()
     env.close()
+
+
+def _current_viewer(env: Any) -> Any:
+    """Return the viewer of a MuJoCo environment, with its OpenGL context made the current one; None if it has none."""
+    viewer = getattr(getattr(env.unwrapped, "mujoco_renderer", None), "viewer", None)
+    if viewer is not None:
+        viewer.make_context_current()
+    return viewer
 
 
 def caption(picture: Picture, title: str, words: Sequence[str]) -> Picture:

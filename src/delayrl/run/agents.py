@@ -182,11 +182,11 @@ def known_agents() -> dict[str, Registration]:
 def _checked(thing: Any, name: str) -> Agent:
     """Return an agent: the given one, or one of the given class. Raises DelayRLError if it is none, or not usable."""
     page = "docs/own-agent.md shows one"
-    names = {field.name for field in fields(thing)} if is_dataclass(thing) else set()
-    lacks = [part for part in PARTS if not hasattr(thing, part) and part not in names]
-    if not is_dataclass(thing) or lacks:
-        what = f"it lacks {', '.join(lacks)}" if is_dataclass(thing) else "it is no dataclass"
-        raise DelayRLError(f"{name} is no agent, because {what}: {page}")
+    if not is_dataclass(thing):
+        raise DelayRLError(f"{name} is no agent, because it is no dataclass: {page}")
+    declared = {field.name for field in fields(thing)}
+    if lacks := [part for part in PARTS if not hasattr(thing, part) and part not in declared]:
+        raise DelayRLError(f"{name} is no agent, because it lacks {', '.join(lacks)}: {page}")
     agent: Any = thing
     if isinstance(thing, type):
         with one_line(f"agent {name} cannot be made without arguments, so its fields need defaults"):

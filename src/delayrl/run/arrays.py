@@ -29,10 +29,9 @@ def save_arrays(path: Path, arrays: Arrays) -> str:
 def load_arrays(path: Path) -> Arrays:
     """Read safetensors. Raises DelayRLError if the file is cut or something else."""
     try:
-        arrays = safetensors.numpy.load_file(path)
+        return safetensors.numpy.load_file(path)  # type: ignore[no-any-return]
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise DelayRLError(f"{path} cannot be read: {first_line(error)}") from error
-    return arrays  # type: ignore[no-any-return]
 
 
 def inner_range(low: NDArray[Any], high: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

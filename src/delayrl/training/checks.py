@@ -148,7 +148,7 @@ def _beginning(env: Delayed) -> NDArray[Any]:
     """Return the observations and rewards of the first three steps from seed 0, in a row."""
     numbers = [np.ravel(stepping.reset(env, 0)[1]["truth"])]
     for _ in range(3):
-        action = np.full(env.action_space.shape or (), 0.1, np.float32)
+        action = np.full(env.action_space.shape, 0.1, np.float32)
         _, reward, terminated, truncated, info = stepping.step(env, action)
         numbers += [np.ravel(info["truth"]), np.ravel(reward)]
         if terminated or truncated:

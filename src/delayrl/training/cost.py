@@ -33,15 +33,14 @@ def cost_of(agent: Agent, spec: Spec, schedule: Schedule) -> Cost:
     counters = _counters(leaves)
     flops, steps = 0.0, dict.fromkeys(counters.values(), 0.0)
     for phase, traced in traced_updates(agent, spec):
-        program = traced.jaxpr.jaxpr
         counts = update_counts(phase, schedule.first_update, schedule.steps)
-        rate = phase.updates / phase.every
+        if not counts.size:
+            continue  # the run ends before
+        program, rate = traced.jaxpr.jaxpr, phase.updates / phase.every
         inputs: list[Value] = [None] * len(program.invars)
         for number in counters:
             inputs[number] = np.zeros(())
         inputs[-1] = counts
-        if not counts.size:
-            continue  # the run ends before
         products, outputs = follow(program, inputs)
         flops += rate * sum(product.flops for product in products)
         for number, name in counters.items():

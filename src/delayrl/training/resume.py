@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import jax
@@ -142,7 +143,7 @@ def _common_checkpoints(group: Group, note: Callable[[str], None]) -> list[Check
     """
     runs = group.folders
     good, broken = zip(*(run.checkpoints() for run in runs), strict=True)
-    for line in (line for lines in broken for line in lines):
+    for line in chain.from_iterable(broken):
         note(line)
     common = set.intersection(*({checkpoint.step for checkpoint in own} for own in good))
     if common:
@@ -228,12 +229,11 @@ def restore(group: Group, actors: list[Actor], checkpoints: list[Checkpoint]) ->
             env = group.setup.condition.env
             raise DelayRLError(f"{env} does not repeat an episode from its seed, so the run cannot be resumed")
     replay = ring.Replay(**{name: jnp.asarray(columns.pop(name)) for name in ring.Replay._fields})
-    pending = [_pending(loop) for loop in loops]
     return TrainState(
         step,
         Learner(agent, replay),
         actors,
-        [list(seeds) for seeds in zip(*pending, strict=True)],
+        [list(seeds) for seeds in zip(*map(_pending, loops), strict=True)],
         np.stack([loop["chosen"] for loop in loops]) if "chosen" in loops[0] else None,
         [dict(checkpoint.pieces) for checkpoint in checkpoints],
         [(int(loop["rows"]), int(loop["steps"])) for loop in loops],

@@ -14,7 +14,6 @@ from gymnasium.wrappers import TimeLimit
 from delayrl.delays import Delay
 from delayrl.errors import DelayRLError, DelayWarning
 
-INSTEAD = "let the environment take a Box of floats, and round inside"
 PACKAGE = str(Path(__file__).parents[1])
 _warned: set[str] = set()
 REPEATS = {"RepeatAction": "num_repeats", "MaxAndSkipObservation": "_skip"}
@@ -67,16 +66,15 @@ def _layers_with_steps(env: Any) -> Iterator[tuple[Any, int]]:
 def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
     """Raise a DelayRLError unless observations are flat, and actions flat, continuous and bounded."""
     if not isinstance(observations, Box) or len(observations.shape) != 1:
-        got = " ".join(str(observations).split())[:200]
-        flat = getattr(observations, "is_np_flattenable", False)
-        hint = (
-            ": gymnasium.wrappers.FlattenObservation, or flatten=True (--flatten) here, makes one of it" if flat else ""
-        )
+        got, hint = " ".join(str(observations).split())[:200], ""
         if isinstance(observations, Box) and observations.dtype == np.uint8 and len(observations.shape) > 1:
             hint = ": nothing here learns from images; observe the pose that is computed from them"
+        elif getattr(observations, "is_np_flattenable", False):
+            hint = ": gymnasium.wrappers.FlattenObservation, or flatten=True (--flatten) here, makes one of it"
         raise DelayRLError(f"{name}: observations must be a Box of flat vectors; got {got}{hint}")
     if not isinstance(actions, Box) or len(actions.shape) != 1 or not np.issubdtype(actions.dtype, np.floating):
-        raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}: {INSTEAD}")
+        hint = "let the environment take a Box of floats, and round inside"
+        raise DelayRLError(f"{name}: actions must be a flat, continuous Box; got {actions}: {hint}")
     if not actions.shape[0]:
         raise DelayRLError(f"{name}: there must be an action; got {actions}")
     if not (np.isfinite(actions.low) & np.isfinite(actions.high) & (actions.low < actions.high)).all():
@@ -87,10 +85,8 @@ def check_spaces(name: str, observations: gym.Space[Any], actions: gym.Space[Any
 
 def limit_of(env: Any) -> int | None:
     """Return the time limit of an environment in steps, the least of its spec's and its layers'; None without one."""
-    limits = []
-    for layer, steps in _layers_with_steps(env):
-        if isinstance(layer, TimeLimit):
-            limits.append(-(-layer._max_episode_steps // steps))
+    layers = _layers_with_steps(env)
+    limits = [-(-layer._max_episode_steps // steps) for layer, steps in layers if isinstance(layer, TimeLimit)]
     if env.spec is not None and env.spec.max_episode_steps is not None:
         limits.append(env.spec.max_episode_steps)
     return min(map(int, limits), default=None)
