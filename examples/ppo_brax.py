@@ -15,28 +15,31 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import matplotlib
 import numpy as np
-from brax import envs
-from brax.training.agents.ppo import networks, train
 
-from delayrl.batched.brax import wrap
-from delayrl.run.provenance import versions
+from delayrl.errors import needs_extra
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+try:
+    import jax
+    import jax.numpy as jnp
+    import matplotlib
+    from brax import envs
+    from brax.training.agents.ppo import networks, train
+
+    from delayrl.batched.brax import wrap
+    from delayrl.run.provenance import versions
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+except ModuleNotFoundError as error:
+    raise SystemExit(needs_extra(error) or error) from error
 
 VIEWS = {
     "blind": {"augment": False, "value": "state"},
     "augmented": {"augment": True, "value": "state"},
     "privileged": {"augment": True, "value": "privileged_state"},
 }
-OURS = (
-    "backend",
-    "hidden",
-)  # options that are not PPO's: physics, and the widths of the policy's and the value's layers
+OURS = ("backend", "hidden")  # options that are not PPO's: physics, and the widths of the policy's and value's layers
 PPO = {"num_timesteps": 1_000_000, "discounting": 0.97, "learning_rate": 3e-4, "normalize_observations": True}
 TASKS: dict[str, dict[str, Any]] = {
     "inverted_pendulum": {  # of brax's notebook, with fewer robots and smaller batches

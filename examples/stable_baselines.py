@@ -11,12 +11,17 @@ import argparse
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import SAC
-from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
 
+from delayrl.errors import needs_extra
 from delayrl.wrappers import AugmentedObservation, Delayed
+
+try:
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.env_checker import check_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.monitor import Monitor
+except ModuleNotFoundError as error:
+    raise SystemExit(needs_extra(error) or error) from error
 
 
 def task(delay: str, augmented: bool) -> gym.Env:

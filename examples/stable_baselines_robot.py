@@ -11,10 +11,15 @@ import argparse
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import SAC
 
 from delayrl.deploy import Controller, adapt, export_layers, load_bundle, stable_baselines_layers
+from delayrl.errors import needs_extra
 from delayrl.wrappers import AugmentedObservation, Delayed
+
+try:
+    from stable_baselines3 import SAC
+except ModuleNotFoundError as error:
+    raise SystemExit(needs_extra(error) or error) from error
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--steps", type=int, default=6000)

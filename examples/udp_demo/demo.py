@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from link import Link
 
+from delayrl.errors import needs_extra
+
 HERE = Path(__file__).parent
 Row = dict[str, Any]
 
@@ -108,6 +110,12 @@ def main() -> None:
     parser.add_argument("--rows", type=Path, default=Path("udp.jsonl"), help="(default: udp.jsonl)")
     parser.add_argument("--picture", type=Path, default=Path("udp.png"), help="(default: udp.png)")
     given = parser.parse_args()
+    try:
+        import mujoco  # noqa: F401  # the simulator, a process of its own, needs it
+
+        import delayrl.run.provenance  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise SystemExit(needs_extra(error) or error) from error
     if given.policy == "predictor":
         print("no --policy: running the predictor, which needs no training.\n" + __doc__.splitlines()[-1] + "\n")
 

@@ -35,6 +35,7 @@ EXTRAS = {
     "parquet": ("pyarrow",),
     "brax": ("brax",),
     "ray": ("ray",),
+    "examples": ("stable_baselines3",),
 }
 """Modules that each extra brings."""
 
