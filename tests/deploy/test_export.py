@@ -33,7 +33,7 @@ def test_a_run_becomes_a_bundle(run: Path, tmp_path: Path, capsys: pytest.Captur
     main(["export", str(run), "--out", str(out)])
     printed = capsys.readouterr().out
     assert "vdpo on Reacher-v5, ages 0..3" in printed
-    assert "up to 60 ms late from a sensor in step with the control loop, up to 50 ms late at any phase" in printed
+    assert "a sensor up to 60 ms late in step with the control loop, up to 50 ms at any phase" in printed
     assert sorted(file.name for file in out.iterdir()) == ["bundle.json", "policy.onnx", "policy.safetensors"]
     assert not [file for file in tmp_path.iterdir() if file != out]
     metadata = load_bundle(out).metadata

@@ -38,7 +38,7 @@ typed(
     "delay episode:4:5",
 )
 holds("80 ms are 4 or 5 steps of 20 ms, and a phase stays", delayrl.Run("phase").config["delay"] == "episode:4:5")
-late = "observations up to 100 ms late from a sensor in step with the control loop, up to 90 ms late at any phase"
+late = "a sensor up to 100 ms late in step with the control loop, up to 90 ms at any phase"
 served = f"{late}; held back until 80 ms late"
 typed("delayrl export phase --out phase-bundle", "ages 4..5", served)
 bundle = load_bundle("phase-bundle")

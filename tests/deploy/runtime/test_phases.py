@@ -105,11 +105,11 @@ def test_what_measure_recommends(delay: int, jitter: int, tmp_path: Path) -> Non
 
 def test_the_delays_that_a_policy_serves() -> None:
     """What it says is what any_phase asks for: two ticks more are an overrun at some phase."""
-    in_step, any_of = "from a sensor in step with the control loop", "at any phase"
+    in_step, any_of = "late in step with the control loop", "at any phase"
     controller = Controller(Ages(3), stamps="seconds", action_delay=1)
-    assert controller.serves == f"observations up to 62.5 ms late {in_step}, up to 46.88 ms late {any_of}"
+    assert controller.serves == f"a sensor up to 62.5 ms {in_step}, up to 46.88 ms {any_of}"
     assert any_phase(0, 1.5)[1] == 2 < any_phase(0, 1.5 + 1 / 128)[1]
-    assert Controller(Ages(3)).serves == f"observations up to 3 steps late {in_step}, up to 2.5 steps late {any_of}"
+    assert Controller(Ages(3)).serves == f"a sensor up to 3 steps {in_step}, up to 2.5 steps {any_of}"
     assert "none at another phase" in Controller(Ages(1), action_delay=1).serves
     for delay, overrun in ((320, False), (322, True)):  # 320 ticks are 2.5 steps
         assert any(play(3, phase, delay)[0].overruns for phase in range(128)) == overrun

@@ -110,9 +110,8 @@ def served(min_age: int, max_age: int, action_delay: int, dt: float | None) -> s
     steps = max_age - action_delay
 
     def late(steps: float) -> str:
-        whole = f"{steps:g} step{'s' * (steps != 1)}"
-        return f"{whole if dt is None else f'{1000 * steps * dt:.4g} ms'} late"
+        return f"{steps:g} step{'s' * (steps != 1)}" if dt is None else f"{1000 * steps * dt:.4g} ms"
 
     phases = f"up to {late(steps - 0.5)} at any phase" if steps else "none at another phase"
-    held = f"; held back until {late(min_age - action_delay)}" if min_age > action_delay else ""
-    return f"observations up to {late(steps)} from a sensor in step with the control loop, {phases}{held}"
+    held = f"; held back until {late(min_age - action_delay)} late" if min_age > action_delay else ""
+    return f"a sensor up to {late(steps)} late in step with the control loop, {phases}{held}"
