@@ -30,12 +30,12 @@ def test_windows_stay_in_their_episode(delay: int, ahead: int, capacity: int) ->
     replay, transitions, _ = filled(300, delay, capacity)
     windows = jax.tree.map(np.asarray, draw(replay, 2000, delay, ahead))
     offset = np.arange(-delay, ahead + 1)
+    number = {float(transition.action[0]): i for i, transition in enumerate(transitions)}  # actions are random
+    unfinished = max(i + 1 for i, transition in enumerate(transitions) if transition.done)
     for i in range(2000):
         (now, length), valid = windows.obs[i, delay], windows.valid[i]
-        expected = (now + offset >= 0) & (now + offset <= length)
-        newest = transitions[-1]
-        if length == newest.next_obs[1] and not newest.done:  # the unfinished episode goes on beyond the data
-            expected = np.where(valid, expected, False) if now + ahead > newest.next_obs[0] else expected
+        stored = length if number[float(windows.action[i, delay, 0])] < unfinished else transitions[-1].next_obs[0]
+        expected = (now + offset >= 0) & (now + offset <= stored)
         np.testing.assert_array_equal(valid, expected)
         np.testing.assert_array_equal(windows.obs[i, valid, 0], (now + offset)[valid])
         assert (windows.obs[i, valid, 1] == length).all()
@@ -67,7 +67,7 @@ def test_every_start_is_drawn_equally() -> None:
 
 
 def test_official_starts() -> None:
-    """With `whole` = 3 the last two starts of an episode are never drawn, and all others are."""
+    """With `until_end` = 3 the last two starts of an episode are never drawn, and all others are."""
     transitions, _ = record(TASK, 2, 120)
     replay = replay_of(transitions, Spec(2, 1, 2), 500, ring.Learnable(until_end=3))
     windows = draw(replay, 20_000, 2, 3)

@@ -2,7 +2,8 @@
 
 Idea: (A) learn a reference policy by SAC without delay; (B) clone it into a delayed policy, a transformer on (last
 observation, actions since) whose belief head reconstructs the unseen states and whose policy head is trained towards
-the reference by KL. Position i serves the delay i + 1, so one network serves all ages 1..Δ; at 0 the reference acts.
+the reference by KL. Position i, counted from 0, serves the age i + 1, so one network serves all ages 1..Δ; at age 0
+the reference acts.
 
 Views: the reference sees s_t, the delayed policy x_t. Privileged in training (reads s_t) unless `behaviour="delayed"`.
 
