@@ -20,7 +20,8 @@ from delayrl.core.types import Spec
 from delayrl.core.views import network_input
 from delayrl.errors import DelayRLError
 
-AGENT = replace(TINY["any-age"], encoder="mlp", pull_weight=1.0)
+PULLED = replace(TINY["any-age"], encoder="mlp", pull_weight=1.0)
+"""A variant whose every part has a hand-computed loss; FORECASTING, below, is the default."""
 
 
 def assert_same_program(one: Agent, other: Agent, delay: int) -> None:
@@ -39,12 +40,12 @@ def program(agent: Agent, delay: int) -> tuple[State, str]:
 
 def test_without_a_second_age_it_is_bpql() -> None:
     """With BPQL's critics normed alike."""
-    assert_same_program(replace(AGENT, second_age="none", pull_weight=0.0), AGENT.bpql, 3)
-    assert program(AGENT, 3)[1] != program(AGENT.bpql, 3)[1]
+    assert_same_program(replace(PULLED, second_age="none", pull_weight=0.0), PULLED.bpql, 3)
+    assert program(PULLED, 3)[1] != program(PULLED.bpql, 3)[1]
 
 
 def test_without_a_delay_it_is_sac() -> None:
-    assert_same_program(AGENT, replace(AGENT.bpql, actor_sees="current"), 0)
+    assert_same_program(PULLED, replace(PULLED.bpql, actor_sees="current"), 0)
 
 
 @pytest.mark.parametrize(("law", "ages"), [(None, "random"), ("uniform:1:4", "random"), ("uniform:1:4", "any")])
@@ -53,7 +54,7 @@ def test_second_views(law: str | None, ages: SecondAge) -> None:
 
     Or each that the episode reaches.
     """
-    agent = replace(AGENT, second_age=ages)
+    agent = replace(PULLED, second_age=ages)
     transitions, windows = counted(4, 300, batch=4000, ahead=1, law=law)
     by_action = {float(t.action[0]): i for i, t in enumerate(transitions)}
     x = np.asarray(agent.second_view(windows, jax.random.key(1)))
@@ -79,29 +80,29 @@ def test_second_views(law: str | None, ages: SecondAge) -> None:
 def test_ages_in_turn_without_a_pull(rng: np.random.Generator) -> None:
     """One view of each sample, half of them at the second age; a pull compares both views of each."""
     own, second = jnp.asarray(rng.normal(size=(2, 6, 4)))
-    mixed = replace(AGENT, pull_weight=0.0).views(own, second)
+    mixed = replace(PULLED, pull_weight=0.0).views(own, second)
     np.testing.assert_array_equal(mixed[0, ::2], own[::2])
     np.testing.assert_array_equal(mixed[0, 1::2], second[1::2])
     assert len(mixed) == 1
-    np.testing.assert_array_equal(AGENT.views(own, second), jnp.stack([own, second]))
-    np.testing.assert_array_equal(AGENT.views(own, None), own[None])
+    np.testing.assert_array_equal(PULLED.views(own, second), jnp.stack([own, second]))
+    np.testing.assert_array_equal(PULLED.views(own, None), own[None])
 
 
 @pytest.mark.parametrize("distance", ["moments", "kl"])
 def test_actor_gradient_by_hand(distance: str) -> None:
     """Half for each age, and the pull of the older policy towards the younger, which is held fixed."""
-    agent = replace(AGENT, pull=distance)
+    agent = replace(PULLED, pull=distance)
     transitions, _ = record("Reacher-v5", 3, 80)
     windows = sampled(transitions, Spec(OBS, ACT, 3), 16, 1)
-    state = AGENT.init(Spec(OBS, ACT, 3), jax.random.key(0))
-    older, critic_input = AGENT.bpql._inputs(windows, 0)
-    younger = AGENT.second_view(windows, jax.random.key(2))
+    state = PULLED.init(Spec(OBS, ACT, 3), jax.random.key(0))
+    older, critic_input = PULLED.bpql._inputs(windows, 0)
+    younger = PULLED.second_view(windows, jax.random.key(2))
     assert not np.allclose(older, younger)
     moved = agent.improve_actor(windows, younger, jnp.float32(3.0), state, older, critic_input, jax.random.key(5))
-    frozen = AGENT.bpql.policy(state.actor, younger)
+    frozen = PULLED.bpql.policy(state.actor, younger)
 
     def value(actor):
-        policies = [AGENT.bpql.policy(actor, x) for x in (older, younger)]
+        policies = [PULLED.bpql.policy(actor, x) for x in (older, younger)]
         drawn = networks.sample(networks.Gaussian(*map(jnp.stack, zip(*policies, strict=True))), jax.random.key(5))
         total = 0.0
         for action, log_prob in zip(*drawn, strict=True):
@@ -110,7 +111,7 @@ def test_actor_gradient_by_hand(distance: str) -> None:
         return total
 
     def pull(actor):
-        policy = AGENT.bpql.policy(actor, older)
+        policy = PULLED.bpql.policy(actor, older)
         if distance == "moments":
             return lifting_loss(policy, frozen)
         scale = jnp.exp(policy.log_std - frozen.log_std)
@@ -124,7 +125,7 @@ def test_actor_gradient_by_hand(distance: str) -> None:
 
 
 def test_annealing_in_parts_of_the_run() -> None:
-    agent = replace(AGENT, pull_weight=2.0, pull_hold=0.25, pull_end=0.75).for_run(Schedule(steps=1000))
+    agent = replace(PULLED, pull_weight=2.0, pull_hold=0.25, pull_end=0.75).for_run(Schedule(steps=1000))
     steps = [0, 250, 375, 500, 750, 1000]
     np.testing.assert_allclose([agent.weight(jnp.int32(n)) for n in steps], [2, 2, 1.5, 1, 0, 0], rtol=1e-6)
     sudden = replace(agent, pull_hold=0.5, pull_end=0.5)
@@ -137,8 +138,8 @@ def test_annealing_in_parts_of_the_run() -> None:
 
 def test_clock_is_the_environment_step() -> None:
     """`count` numbers updates: with two every four steps, updates 2i and 2i + 1 happen at step 4i."""
-    bpql = replace(AGENT.bpql, update_every=4, updates=2)
-    agent = replace(AGENT, bpql=bpql, pull_weight=2.0, pull_hold=0.25, pull_end=0.75).for_run(Schedule(steps=16))
+    bpql = replace(PULLED.bpql, update_every=4, updates=2)
+    agent = replace(PULLED, bpql=bpql, pull_weight=2.0, pull_hold=0.25, pull_end=0.75).for_run(Schedule(steps=16))
     spec = Spec(OBS, ACT, 3)
     given = agent.init(spec, jax.random.key(0)), random_windows(spec), jax.random.key(1)
     weight_at = jax.jit(lambda count: agent.update(*given, count)[1]["pull_weight"])  # compiles nothing else
@@ -146,7 +147,7 @@ def test_clock_is_the_environment_step() -> None:
         np.testing.assert_allclose(weight_at(jnp.int32(count)), weight)
 
 
-SEQUENTIAL = replace(AGENT, encoder="transformer", encoder_width=8, belief_weight=0.5)
+SEQUENTIAL = replace(PULLED, encoder="transformer", encoder_width=8, belief_weight=0.5)
 
 
 def test_a_sequence_is_read_at_its_age(rng: np.random.Generator) -> None:
@@ -168,10 +169,10 @@ def test_a_sequence_is_read_at_its_age(rng: np.random.Generator) -> None:
 def test_a_sequence_without_a_delay_is_sac() -> None:
     plain = replace(SEQUENTIAL, second_age="none", belief_weight=0.0)
     for agent in (SEQUENTIAL, plain, FORECASTING):
-        assert_same_program(agent, replace(AGENT.bpql, actor_sees="current"), 0)
+        assert_same_program(agent, replace(PULLED.bpql, actor_sees="current"), 0)
 
 
-FORECASTING = replace(AGENT, encoder="forecast")
+FORECASTING = replace(PULLED, encoder="forecast")
 VALUED = replace(FORECASTING, forecast_learns_from="states+values")
 
 
