@@ -21,7 +21,7 @@ from delayrl.core.views import network_input
 from delayrl.errors import DelayRLError
 
 PULLED = replace(TINY["any-age"], encoder="mlp", pull_weight=1.0)
-"""A variant whose every part has a hand-computed loss; FORECASTING, below, is the default."""
+"""A variant whose every part has a hand-computed loss; FORECASTING, below, has the default encoder."""
 
 
 def assert_same_program(one: Agent, other: Agent, delay: int) -> None:
