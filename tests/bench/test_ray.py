@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from support import assert_same_results, tiny
@@ -31,6 +32,14 @@ def test_without_ray(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(delayrl.DelayRLError, match=r"pip install 'delayrl\[ray\]'"):
         connect(None)
+
+
+def test_without_an_address_no_other_cluster_is_joined(monkeypatch) -> None:
+    """Ray itself would take one that runs on this machine, or that RAY_ADDRESS names: its nodes may see other files."""
+    given: list[dict] = []
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=lambda **options: given.append(options)))
+    connect(None)
+    assert given[0]["address"] == "local"
 
 
 @needs_ray

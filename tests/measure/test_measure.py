@@ -770,9 +770,10 @@ def test_overtaken_observations_leave_the_older_in_use(tmp_path: Path) -> None:
 
 
 def test_a_pause_is_not_a_delay(tmp_path: Path) -> None:
-    """Two recordings in a file: nobody waited for an observation between them."""
+    """Two recordings in a file: nobody waited for an observation between them, and the robot warmed up once."""
     made = ROW * np.arange(60) + 3600.0 * (np.arange(60) >= 30)
     e = from_log(stamps(tmp_path / "log.csv", made, 2.2 * ROW), ROW)
+    assert e.rows == 57  # without the first twentieth of the log, in which the pause does not count
     assert e.train_with == "episode:2:3"
     e.save(tmp_path / "steps.txt")
     assert (tmp_path / "steps.txt").read_text().split() == ["3"] * e.rows

@@ -13,6 +13,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.wrappers import RepeatAction, TimeLimit
 from PIL import Image, ImageSequence
 
 import delayrl.play.video as video
@@ -268,6 +269,17 @@ def test_frames_of_a_gif_take_their_time(tmp_path: Path, rate: float) -> None:
     with video._video(tmp_path / "one.gif", rate) as add:
         add(halves)
     assert (tmp_path / "one.gif").stat().st_size > 0
+
+
+def test_an_episode_of_repeated_actions_takes_its_real_time() -> None:
+    """A step of it is several of the task's frames; a wrapper of one's own says so by its `dt`."""
+    task, twice = gym.make("Pusher-v5"), gym.Wrapper(gym.make("Pusher-v5"))
+    twice.dt = 2 * task.unwrapped.dt
+    silent = gym.Wrapper(make(lambda: TimeLimit(Arm(), 20)))  # says neither dt nor render_fps
+    assert video._rate(task) == 20
+    assert video._rate(RepeatAction(task, num_repeats=4)) == pytest.approx(5)
+    assert video._rate(twice) == pytest.approx(10)
+    assert (video._rate(silent), video._rate(RepeatAction(silent, num_repeats=3))) == (30, 10)
 
 
 def test_titles_of_two_runs_differ() -> None:

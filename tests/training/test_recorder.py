@@ -89,7 +89,9 @@ def test_what_is_not_finite_is_not_written(played: Any) -> None:
 
 
 def test_tensorboard_goes_on_where_the_run_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a stopped run had logged after its checkpoint is not shown; the file is closed with the run."""
+    """What a stopped run had logged after its checkpoint is not shown, what it had logged at its step is (TensorBoard
+    hides `purge_step` and what comes after); the file is closed with the run.
+    """
     done = []
 
     def writer(folder: str, purge_step: int) -> Any:
@@ -100,7 +102,7 @@ def test_tensorboard_goes_on_where_the_run_does(tmp_path: Path, monkeypatch: pyt
     tracker = Tracker("tensorboard", tmp_path, 300)
     tracker.write(400, {"return/agent": 1.5})
     tracker.close()
-    assert done == [(str(tmp_path / "tensorboard"), 300), ("return/agent", 1.5, 400), "closed"]
+    assert done == [(str(tmp_path / "tensorboard"), 301), ("return/agent", 1.5, 400), "closed"]
     nothing = Tracker(None, tmp_path, 0)
     nothing.write(400, {"return/agent": 1.5})
     nothing.close()

@@ -18,6 +18,7 @@ from delayrl.wrappers.layers import check_length
 from delayrl.wrappers.layers import check_limit as check_limit
 from delayrl.wrappers.layers import name_of as name_of
 from delayrl.wrappers.layers import seconds_of as seconds_of
+from delayrl.wrappers.layers import task_steps_of as task_steps_of
 from delayrl.wrappers.transit import Fill
 
 

@@ -24,8 +24,9 @@ def by_stamps(
     delays = arrived - made
     start, first, row_spacing = _one_clock(path, made, inside)
     made, delays = made[0] + start, delays[first]
-    warm = reading.WARM_UP * float(start[-1]) if warm_up is None else warm_up
-    used = start >= warm
+    since = ages.without_pauses(start, row_spacing)
+    warm = reading.WARM_UP * float(since[-1]) if warm_up is None else warm_up
+    used = since >= warm
     if used.sum() < 10:
         raise DelayRLError(f"{path}: {used.sum()} rows are left after a warm-up of {warm:g} s: too few")
     kept, period = delays[used], period or row_spacing

@@ -16,7 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from delayrl.delays import Delay, DelayLike
-from delayrl.envs.making import check_limit, make, name_of
+from delayrl.envs.making import check_limit, make, name_of, task_steps_of
 from delayrl.envs.task import Task, TaskLike, stored_task
 from delayrl.errors import DelayRLError, one_line
 from delayrl.play import stepping
@@ -106,7 +106,7 @@ def watch(
             stack.callback(close, played)
             check_fits(played, policy.spec)
             check_limit(played, str(task))
-            rate = float(played.metadata.get("render_fps") or 30)
+            rate = _rate(played)
             stride = max(1, round(rate / FASTEST[out.suffix]))
             titles.append(f"{config['agent']}, delay {served.label()}")
             episodes.append(partial(_episode, played, policy, seed, camera, stride))
@@ -148,6 +148,11 @@ def _rendering(task: Task, delay: Delay) -> Any:
             line = f"a video needs an environment that takes render_mode, and {task} does not"
             raise DelayRLError(f"{line}: docs/own-task.md shows one") from error
         raise
+
+
+def _rate(env: Any) -> float:
+    """Return how many steps of an environment a second has. Its render_fps counts those of the task itself."""
+    return float(env.metadata.get("render_fps") or 30) / task_steps_of(env)
 
 
 def _picture(env: Any) -> Picture:

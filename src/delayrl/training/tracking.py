@@ -16,7 +16,8 @@ class Tracker:
         if kind == "tensorboard":
             from tensorboardX import SummaryWriter
 
-            writer = SummaryWriter(str(path / "tensorboard"), purge_step=step)  # a stopped run may have been further
+            # a stopped run may have been further; what it logged at `step` itself stays
+            writer = SummaryWriter(str(path / "tensorboard"), purge_step=step + 1)
             self.close = writer.close
             self.write = lambda step, values: [writer.add_scalar(k, v, step) for k, v in values.items()]
         elif kind == "wandb":

@@ -38,6 +38,13 @@ def seconds_of(env: Any) -> float | None:
     return None
 
 
+def task_steps_of(env: Any) -> float:
+    """Return how many steps of the task itself are a step of an environment: more than 1 if a wrapper repeats them."""
+    own, task = seconds_of(env), seconds_of(env.unwrapped)
+    *_, (_, repeats) = _layers_with_steps(env)
+    return own / task if own and task else repeats
+
+
 def _check_unit(env: Any, layer: Any, dt: float) -> None:
     """Warn of a step that is far longer than the frames of the environment are apart: it may be in milliseconds."""
     frames = (getattr(layer, "metadata", None) or {}).get("render_fps")

@@ -121,7 +121,8 @@ def connect(address: str | None) -> Any:
     quiet = {"log_to_driver": False, "logging_level": "error", "ignore_reinit_error": True}
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     if address is None:
-        ray.init(include_dashboard=False, **quiet)
+        # without an address Ray would join one that is here already, or that RAY_ADDRESS names
+        ray.init(address="local", include_dashboard=False, **quiet)
         return ray
     _check_address(address)
     errors: list[BaseException] = []
