@@ -24,7 +24,7 @@ def draft(path: Path, *, shared: bool = False) -> Iterator[Path]:
     remove(name)
     try:
         yield name
-        name.replace(path)
+        name.rename(path)
     except BaseException:
         with contextlib.suppress(OSError):
             remove(name)
