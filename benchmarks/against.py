@@ -24,6 +24,9 @@ VARIANTS = (
     "`any-age`, `forecast_learns_from=states+values`",
     "`any-age`, `forecast_error=distance`",
     "`bpql`, `batch_size=128`",
+    "`bpql`, `batch_size=128`, `critic_norm=layer`",
+    "`any-age`, `batch_size=128`",
+    "`any-age`, `batch_size=128`, `encoder=mlp`",
 )
 """Shown beside the arms of the first page."""
 

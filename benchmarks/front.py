@@ -47,6 +47,8 @@ COLOURS = {
     "`lifting`": STYLES["lifting"][0],
     "`bpql`": STYLES["bpql"][0],
     "`bpql`, `critic_norm=layer`": STYLES["bpql"][1],
+    "`bpql`, `batch_size=128`, `critic_norm=layer`": "#b5d800",
+    "`any-age`, `batch_size=128`, `encoder=mlp`": "#e0529c",
     "`a-sac`": STYLES["a-sac"][0],
     "`dcac`": STYLES["dcac"][0],
     "`sac-memoryless`": STYLES["sac-memoryless"][0],
