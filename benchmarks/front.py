@@ -154,6 +154,7 @@ def draw(chosen: Chosen, out: Path) -> None:
         axes.locator_params(axis="x", nbins=4)
     labels = [label for label in COLOURS if label in lines]
     names = [label.replace("`", "") for label in labels]
-    figure.legend([lines[label] for label in labels], names, loc="outside lower center", ncols=4, frameon=False)
+    handles = [lines[label] for label in labels]
+    figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)

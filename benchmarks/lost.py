@@ -93,7 +93,7 @@ def draw(policies: dict[str, Runs], out: Path) -> None:
         for number, run in enumerate(runs.values()):
             steps = np.repeat([step / 1000 for step in run], [len(x) for x in run.values()])
             axes.plot(steps, np.concatenate([*run.values()]), ".", color=f"C{number % 10}", markersize=3, alpha=0.5)
-        axes.set_title(f"{words.replace('`', '')}, {len(runs)} seeds", fontsize=10)
+        axes.set_title(f"{words.replace('`', '')}, {len(runs)} seeds", fontsize=8)
         axes.grid(alpha=0.25)
         axes.tick_params(labelbottom=True)
     for axes in panels.flat[len(policies) :]:
