@@ -21,6 +21,7 @@ from delayrl.bench import results as bench
 from delayrl.bench.results import Collected
 from delayrl.errors import DelayRLError
 from delayrl.report import statistics
+from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.summary import summarise
@@ -203,10 +204,12 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
 def draw(arms: list[Result], out: Path) -> None:
     """Draw the mean curves of the arms: a panel for any-age and its variants, one for BPQL's, with SAC in both."""
     figure, panels = pyplot.subplots(1, 2, figsize=(10, 5.6), sharey=True, layout="constrained")
-    for axes, title in zip(panels, ("any-age and its arms", "BPQL and its arms"), strict=True):
-        sac = [arm for arm in arms if arm.condition.agent == "sac"]
-        own = [arm for arm in arms if arm not in sac and ("bpql" in name(arm)) == title.startswith("BPQL")]
-        greys, tab = itertools.cycle(("#333333", "#999999")), itertools.cycle(pyplot.get_cmap("tab10").colors)
+    sac = [arm for arm in arms if arm.condition.agent == "sac"]
+    bpql = [arm for arm in arms if arm.condition.agent == "bpql"]
+    rest = [arm for arm in arms if arm.condition.agent not in ("sac", "bpql")]
+    for axes, title, own in zip(panels, ("any-age and its arms", "BPQL and its arms"), (rest, bpql), strict=True):
+        greys = itertools.cycle((STYLES["sac"][0], STYLES["random"][0]))
+        tab = itertools.cycle(pyplot.get_cmap("tab10").colors)
         looks = [*zip(sac, greys, strict=False), *zip(own, tab, strict=False)]
         for result, colour in looks:
             curve(axes, *result.curves, colour, each=False).set_label(name(result).replace("`", ""))
