@@ -23,6 +23,7 @@ if sys.argv[1] != "plain":
 import jax, jax.numpy as jnp
 large = jax.jit(lambda x: jnp.sin(jnp.outer(x, x)) @ jnp.ones((x.size, 8)))
 x = jnp.ones(int(sys.argv[2]))
+kept = [jax.jit(jnp.outer)(x, x).block_until_ready() for _ in sys.argv[3:]]
 faults = []
 for _ in range(30):  # the first on each of JAX's threads has fresh pages
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -65,6 +66,7 @@ def test_no_fresh_pages() -> None:
     assert int(python(FAULTS, "small", small)) < 500
     assert int(python(FAULTS, "small", large)) > 5_000  # more than a thread's heap has room for
     assert int(python(FAULTS, "paper", large)) < 500
+    assert int(python(FAULTS, "small", small, "kept")) < 500  # a heap that is mapped for the second block stays
 
 
 @pytest.mark.thorough

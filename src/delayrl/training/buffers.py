@@ -18,7 +18,7 @@ LARGE = 50 * 2**20
 
 XLA's allocation for such an update can exceed the 64 MB that glibc has room for in the heap of another thread.
 """
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
+TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD = -1, -2, -3  # glibc's malloc.h
 
 
 def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> None:
@@ -35,6 +35,7 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> None:
     if mallopt is None or not mallopt(MMAP_THRESHOLD, 2**26):  # an old glibc accepts no more than 32 MB
         return
     mallopt(TRIM_THRESHOLD, 2**27)
+    mallopt(TOP_PAD, 2**26)  # a heap of another thread that a block leaves empty is unmapped if it is larger than this
     on_main_thread = threading.current_thread() is threading.main_thread()
     if not on_main_thread or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
         return
