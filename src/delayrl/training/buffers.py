@@ -35,7 +35,7 @@ def keep_buffers(agent: Agent, spec: Spec, seeds: int) -> None:
     if mallopt is None or not mallopt(MMAP_THRESHOLD, 2**26):  # an old glibc accepts no more than 32 MB
         return
     mallopt(TRIM_THRESHOLD, 2**27)
-    mallopt(TOP_PAD, 2**26)  # a heap of another thread that a block leaves empty is unmapped if it is larger than this
+    mallopt(TOP_PAD, 2**26)  # as large as a heap: else one of another thread is unmapped when it is empty
     on_main_thread = threading.current_thread() is threading.main_thread()
     if not on_main_thread or seeds * max(product_bytes(agent, spec), default=0) < LARGE:
         return
