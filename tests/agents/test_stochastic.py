@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from learners import program_of
 
 import delayrl
-from conftest import TINY, learned, record, replay_of
+from conftest import TINY, learned, quick, record, replay_of
 from delayrl.cli import main as cli
 from delayrl.core import replay as ring
 from delayrl.core.protocol import OFFICIAL
@@ -130,7 +130,7 @@ def test_a_recorded_delay_needs_its_file_only_once(tmp_path: Path) -> None:
     assert len(run.rows()[0]["delay"]) < 40
 
 
-@pytest.mark.parametrize("agent", ["vdpo", "dida"])
+@pytest.mark.parametrize("agent", quick(["vdpo", "dida"], "vdpo"))
 def test_train_and_evaluate_a_delay_of_each_episode(agent: str, tmp_path: Path) -> None:
     """Each start state under the delay of its seed: the return is that under this delay alone."""
     run = train(agent, tmp_path / "run", delay="action=episode:1:3")
