@@ -110,7 +110,7 @@ def test_learning_copies_no_replay(seeds: int, block: int) -> None:
         assert compiled.memory_analysis().temp_size_in_bytes < capacity  # a column has a byte a row, or more
 
 
-@pytest.mark.parametrize("block", [1, 3])
+@pytest.mark.parametrize("block", [pytest.param(1, marks=pytest.mark.thorough), 3])
 def test_learning_in_calls_apart_is_learning_as_one(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """On old JAX writing and reading the replay are calls of their own: the same learner, up to rounding."""
     keys, data, ends = jax.vmap(jax.random.key)(jnp.arange(1)), record(ENV, 3, 60)[0], []

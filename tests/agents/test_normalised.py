@@ -14,6 +14,7 @@ from conftest import TINY, record
 from delayrl.agents.base import Agent
 from delayrl.agents.normalised import Moments, NormalisedObservations, merged
 from delayrl.core.types import Spec
+from delayrl.play.run import Run
 from short_runs import assert_same_networks, killed_and_resumed, train
 
 MOMENTS = Moments(jnp.float32(100), jnp.linspace(-3, 3, OBS), 100 * jnp.linspace(0.2, 4, OBS) ** 2)
@@ -34,10 +35,13 @@ def test_moments_are_those_of_all_batches(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(moments.squares / moments.number, everything.var(0), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["bpql", "vdpo"])
-def test_an_update_is_the_inner_agents_on_normalised_windows(name: str) -> None:
+TWO_PHASES = replace(TINY["vdpo"], representation="mlp")
+
+
+@pytest.mark.parametrize("inner", [TINY["bpql"], TWO_PHASES], ids=["bpql", "vdpo"])
+def test_an_update_is_the_inner_agents_on_normalised_windows(inner: Agent) -> None:
     """The first phase adds its sampled states to the moments before it uses them; rows that are not valid stay 0."""
-    inner, spec = TINY[name], Spec(OBS, ACT, 3)
+    spec = Spec(OBS, ACT, 3)
     agent = NormalisedObservations(inner)
     windows = random_windows(spec)
     windows = replace(windows, obs=7 * windows.obs + 2, valid=windows.valid.at[:, 0].set(False))
@@ -88,16 +92,23 @@ def test_a_constant_entry_is_no_division_by_zero() -> None:
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((learner.agent, metrics)))
 
 
-def test_a_run_keeps_its_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed and resumed it is the same run; loaded, its policy has them."""
-    whole = train("bpql", tmp_path / "whole", observation_norm="running")
+@pytest.fixture(scope="module")
+def normed(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return train("bpql", tmp_path_factory.mktemp("normed") / "run", observation_norm="running")
+
+
+@pytest.mark.thorough
+def test_killed_and_resumed_it_is_the_same_run(normed: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, observation_norm="running")
-    assert cut.rows() == whole.rows()
-    assert_same_networks(cut, whole)
-    policy = delayrl.load(whole.path)
+    assert cut.rows() == normed.rows()
+    assert_same_networks(cut, normed)
+    assert train("bpql", tmp_path / "plain").rows() != normed.rows()
+
+
+def test_a_loaded_policy_has_its_moments(normed: Run, tmp_path: Path) -> None:
+    policy = delayrl.load(normed.path)
     assert isinstance(policy.agent, NormalisedObservations)
     assert policy.state.moments.number == 201 * 8  # updates of the run, windows of a batch
-    assert train("bpql", tmp_path / "plain").rows() != whole.rows()
     with pytest.raises(delayrl.DelayRLError, match="observation_norm must be one of none, running; got 'batch'"):
         train("bpql", tmp_path / "bad", observation_norm="batch")
 

@@ -23,10 +23,11 @@ from delayrl.delays import Channel, Constant, Delay, DelayLaw, as_delay
 from delayrl.play.evaluation import evaluate
 from delayrl.training.actor import Actor
 from delayrl.training.loop import hidden_steps
-from short_runs import killed_and_resumed, train
+from short_runs import SHRINK, killed_and_resumed, train
 from strategies import CHANNELS, EPISODES
 
 DELAYED = [name for name in TINY if name != "sac"]
+UNLIKE = ("bpql", "any-age", "ad-sac", "dcac", "dida", "vdpo")  # the others sample as BPQL does
 STOCHASTIC, OF_EPISODES = "uniform:1:3@raw", "1+action=episode:choice:0=0.5,2=0.5"
 
 
@@ -61,7 +62,10 @@ def test_round_trip(channel: Channel, lag: DelayLaw, seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "delay"),
-    [*((name, STOCHASTIC) for name in DELAYED), pytest.param("bpql", OF_EPISODES, marks=pytest.mark.thorough)],
+    [
+        *(pytest.param(*each.values, STOCHASTIC, marks=each.marks) for each in quick(DELAYED, *UNLIKE)),
+        pytest.param("bpql", OF_EPISODES, marks=pytest.mark.thorough),
+    ],
 )
 def test_every_agent_learns_under_random_delays(name: str, delay: str) -> None:
     """Some updates on raw, unordered ages, or on another age in each episode: all finite, and the parameters move."""
@@ -123,14 +127,14 @@ def test_rows_name_the_physics(tmp_path: Path) -> None:
 def test_a_recorded_delay_needs_its_file_only_once(tmp_path: Path) -> None:
     trace = tmp_path / "trace.csv"
     trace.write_text("delay\n" + "\n".join(["2", "0", "3"] * 20))
-    run = train("a-sac", tmp_path / "run", delay=f"recorded:{trace}")
+    run = train(SHRINK, tmp_path / "run", delay=f"recorded:{trace}")
     trace.unlink()
     assert delayrl.load(run.path).spec.delay == 3
     assert np.isfinite(evaluate(run.path, 2)["mean_return"])
     assert len(run.rows()[0]["delay"]) < 40
 
 
-@pytest.mark.parametrize("agent", quick(["vdpo", "dida"], "vdpo"))
+@pytest.mark.parametrize("agent", quick(["bpql", "vdpo", "dida"], "bpql"))
 def test_train_and_evaluate_a_delay_of_each_episode(agent: str, tmp_path: Path) -> None:
     """Each start state under the delay of its seed: the return is that under this delay alone."""
     run = train(agent, tmp_path / "run", delay="action=episode:1:3")

@@ -176,7 +176,7 @@ def test_the_reference_is_sac() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize(("tokens", "number"), [(4, 2), (640, 16)])
+@pytest.mark.parametrize(("tokens", "number"), [(4, 2), pytest.param(640, 16, marks=pytest.mark.thorough)])
 def test_tokens_bound_the_windows_of_belief_and_cloning(tokens: int, number: int) -> None:
     """A window has three. The reference learns from the whole batch all the same."""
     agent, windows, key = dataclasses.replace(TINY["vdpo"], dropout=0.0), random_windows(SPEC), jax.random.key(1)

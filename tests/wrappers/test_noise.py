@@ -12,7 +12,7 @@ from delayrl.core.protocol import Protocol
 from delayrl.envs.probe import Walk
 from delayrl.training.actor import Actor
 from delayrl.wrappers import Delayed, NoisyActions
-from short_runs import assert_same_networks, killed_and_resumed, train
+from short_runs import killed_and_resumed, train
 
 gym.register(
     "delayrl/NoisyWalk-v0",
@@ -132,13 +132,13 @@ def test_each_episode_has_noise_of_its_own(start_states, different: int) -> None
 
 
 def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Training on a noisy task by its id; in the middle of an episode the run goes on as if uninterrupted."""
-
+    """On a noisy task by its id, in the middle of an episode: the same transitions as uninterrupted."""
     options = {"env": "delayrl/NoisyReacher-v4", "delay": 2}
-    whole = train("bpql", tmp_path / "whole", **options)
-    cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, **options)
+    whole = train("random", tmp_path / "whole", **options)
+    cut = killed_and_resumed("random", tmp_path / "cut", monkeypatch, **options)
     assert cut.rows() == whole.rows()
-    assert_same_networks(cut, whole)
+    pieces = {file.name: file.read_bytes() for file in (whole.path / "replay").iterdir()}
+    assert {file.name: file.read_bytes() for file in (cut.path / "replay").iterdir()} == pieces
 
 
 def test_the_papers_noisy_tasks() -> None:
