@@ -88,7 +88,7 @@ def test_ages_in_turn_without_a_pull(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(PULLED.views(own, None), own[None])
 
 
-@pytest.mark.parametrize("distance", ["moments", "kl"])
+@pytest.mark.parametrize("distance", ["moments", pytest.param("kl", marks=pytest.mark.thorough)])
 def test_actor_gradient_by_hand(distance: str) -> None:
     """Half for each age, and the pull of the older policy towards the younger, which is held fixed."""
     agent = replace(PULLED, pull=distance)
@@ -259,7 +259,7 @@ def test_values_may_move_the_forecast() -> None:
             replace(agent, encoder="mlp").for_run(Schedule())
 
 
-@pytest.mark.parametrize("pulled", [True, False])
+@pytest.mark.parametrize("pulled", [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_a_forecast_is_learned_in_an_update(pulled: bool) -> None:
     """At both ages, at both in turn, or at its own alone, towards the true state."""
     agent = replace(FORECASTING, pull_weight=float(pulled))

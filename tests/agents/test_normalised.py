@@ -38,7 +38,9 @@ def test_moments_are_those_of_all_batches(rng: np.random.Generator) -> None:
 TWO_PHASES = replace(TINY["vdpo"], representation="mlp")
 
 
-@pytest.mark.parametrize("inner", [TINY["bpql"], TWO_PHASES], ids=["bpql", "vdpo"])
+@pytest.mark.parametrize(
+    "inner", [pytest.param(TINY["bpql"], marks=pytest.mark.thorough), TWO_PHASES], ids=["bpql", "vdpo"]
+)
 def test_an_update_is_the_inner_agents_on_normalised_windows(inner: Agent) -> None:
     """The first phase adds its sampled states to the moments before it uses them; rows that are not valid stay 0."""
     spec = Spec(OBS, ACT, 3)

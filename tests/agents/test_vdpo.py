@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from learners import ACT, ENV, OBS, counted, random_windows, same, sampled, seen
 
-from conftest import TINY, TINY_SAC, record
+from conftest import TINY, TINY_SAC, quick, record
 from delayrl.agents.registry import AGENTS
 from delayrl.agents.vdpo import VDPO, unseen
 from delayrl.core import networks
@@ -39,7 +39,7 @@ def vdpo_parts(agent: VDPO, delay: int = 3):
     return agent.init(spec, jax.random.key(0)), sampled(transitions, spec, 16, 3)
 
 
-@pytest.mark.parametrize("representation", ["transformer", "transformer-no-belief", "mlp"])
+@pytest.mark.parametrize("representation", quick(["transformer", "transformer-no-belief", "mlp"], "transformer"))
 def test_who_learns_what(representation: str) -> None:
     """Belief trains encoder and decoder; cloning the head alone, and the encoder too where nothing else does."""
     agent = dataclasses.replace(TINY["vdpo"], representation=representation)
