@@ -91,6 +91,12 @@ def assert_same_networks(one: RunLike, other: RunLike) -> None:
         np.testing.assert_array_equal(array, theirs[name], name, strict=True)
 
 
+def assert_same_replay(one: RunLike, other: RunLike) -> None:
+    """The replays of two runs are stored in the same files, byte for byte."""
+    mine, theirs = ({file.name: file.read_bytes() for file in (Path(run) / "replay").iterdir()} for run in (one, other))
+    assert mine == theirs
+
+
 @contextmanager
 def at_step(number: int, call: Callable[[], object]) -> Iterator[None]:
     """Call something just before the environment step of this number."""

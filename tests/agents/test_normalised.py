@@ -100,7 +100,7 @@ def normed(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.mark.thorough
-def test_killed_and_resumed_it_is_the_same_run(normed: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_and_resumed(normed: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cut = killed_and_resumed("bpql", tmp_path / "cut", monkeypatch, observation_norm="running")
     assert cut.rows() == normed.rows()
     assert_same_networks(cut, normed)

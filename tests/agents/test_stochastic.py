@@ -23,7 +23,7 @@ from delayrl.delays import Channel, Constant, Delay, DelayLaw, as_delay
 from delayrl.play.evaluation import evaluate
 from delayrl.training.actor import Actor
 from delayrl.training.loop import hidden_steps
-from short_runs import SHRINK, killed_and_resumed, train
+from short_runs import SHRINK, assert_same_replay, killed_and_resumed, train
 from strategies import CHANNELS, EPISODES
 
 DELAYED = [name for name in TINY if name != "sac"]
@@ -109,8 +109,7 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, del
 
     cut = killed_and_resumed("random", tmp_path / "cut", monkeypatch, delay=delay)
     assert cut.rows() == whole.rows()
-    pieces = {file.name: file.read_bytes() for file in (whole.path / "replay").iterdir()}
-    assert {file.name: file.read_bytes() for file in (cut.path / "replay").iterdir()} == pieces
+    assert_same_replay(cut, whole)
 
 
 def test_rows_name_the_physics(tmp_path: Path) -> None:

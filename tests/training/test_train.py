@@ -75,8 +75,8 @@ def test_first_update(delay: str, update_after: int, first: int, tmp_path: Path)
 
 def test_first_update_of_an_agent_that_sees_the_true_state(tmp_path: Path) -> None:
     """It waits for nothing to arrive."""
-    short = {"delay": 20, "steps": 200, "random_steps": 100, "update_after": 2}
-    run = train("vdpo", tmp_path / "run", representation="mlp", **short)
+    options = {"delay": 20, "steps": 200, "random_steps": 100, "update_after": 2, "representation": "mlp"}
+    run = train("vdpo", tmp_path / "run", **options)
     counts = {name: int(array) for name, array in arrays(run).items() if name.endswith("critic_opt_state.0.count")}
     assert set(counts.values()) == {200 - 2 + 1}, counts
 

@@ -12,7 +12,7 @@ from delayrl.core.protocol import Protocol
 from delayrl.envs.probe import Walk
 from delayrl.training.actor import Actor
 from delayrl.wrappers import Delayed, NoisyActions
-from short_runs import killed_and_resumed, train
+from short_runs import assert_same_replay, killed_and_resumed, train
 
 gym.register(
     "delayrl/NoisyWalk-v0",
@@ -137,8 +137,7 @@ def test_killed_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     whole = train("random", tmp_path / "whole", **options)
     cut = killed_and_resumed("random", tmp_path / "cut", monkeypatch, **options)
     assert cut.rows() == whole.rows()
-    pieces = {file.name: file.read_bytes() for file in (whole.path / "replay").iterdir()}
-    assert {file.name: file.read_bytes() for file in (cut.path / "replay").iterdir()} == pieces
+    assert_same_replay(cut, whole)
 
 
 def test_the_papers_noisy_tasks() -> None:
