@@ -146,7 +146,7 @@ def test_train_and_evaluate_a_delay_of_each_episode(agent: str, tmp_path: Path) 
 
 
 def test_evaluate_any_other_delay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = train("vdpo", tmp_path / "run", delay="uniform:1:3")
+    run = train("any-age", tmp_path / "run", delay="uniform:1:3")
     returns = {d: evaluate(run.path, 2, d)["mean_return"] for d in (None, 0, "2@fifo", "2+action=1", "uniform:0:3@raw")}
     assert len(set(returns.values())) == 5
     with pytest.raises(delayrl.DelayRLError, match="up to 3"):

@@ -64,6 +64,7 @@ def test_folded_critic_has_the_moments_in_its_layers() -> None:
     np.testing.assert_allclose(networks.mlp(mlp, jnp.asarray(x[:3]))[:, 0], q[:3], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_update_by_hand(windows: Window) -> None:
     """The critics' step follows a loss whose targets are numbers, from the same pass over both batches."""
     state, key = AGENT.init(SPEC, jax.random.key(1)), jax.random.key(2)

@@ -20,7 +20,7 @@ from short_runs import newest, refused
 
 SMALL = ["--steps", "240", "--random-steps", "100", "--evaluate-every", "120", "--evaluation-episodes", "2"]
 SMALL += ["--batch-size", "8", "--hidden", "8", "8", "--replay-capacity", "250"]
-TINY = [*SMALL, "--width", "8", "--layers", "1", "--clone-every", "50", "--clone-updates", "5", "--quiet"]
+TINY = [*SMALL, "--representation", "mlp", "--clone-every", "50", "--clone-updates", "5", "--quiet"]
 
 
 @pytest.fixture(scope="module")

@@ -84,7 +84,7 @@ def test_first_update_of_an_agent_that_sees_the_true_state(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("precision", "words"),
     [
-        ("float32", "precision = [HIGHEST, HIGHEST]"),
+        pytest.param("float32", "precision = [HIGHEST, HIGHEST]", marks=pytest.mark.thorough),
         ("bfloat16", "lhs_precision_type = bf16, rhs_precision_type = bf16, accumulation_type = f32"),
     ],
 )
