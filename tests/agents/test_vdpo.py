@@ -176,25 +176,26 @@ def test_the_reference_is_sac() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 
 
-BOUNDED = dataclasses.replace(TINY["vdpo"], dropout=0.0)
+def bounded(tokens: int, number: int):
+    """An agent without a bound, the same with one, a batch, and as many of its windows as the bound leaves."""
+    agent, windows = dataclasses.replace(TINY["vdpo"], dropout=0.0), random_windows(SPEC)
+    return agent, dataclasses.replace(agent, tokens=tokens), windows, jax.tree.map(lambda x: x[:number], windows)
 
 
-def test_tokens_bound_the_windows_of_cloning() -> None:
-    """A window has three tokens."""
-    few, windows, key = dataclasses.replace(BOUNDED, tokens=4), random_windows(SPEC), jax.random.key(1)
-    first = jax.tree.map(lambda x: x[:2], windows)
-    state, count = BOUNDED.init(SPEC, jax.random.key(0)), jnp.int32(1)
-    assert same(few.clone(state, windows, key, count)[0].head, BOUNDED.clone(state, first, key, count)[0].head)
+@pytest.mark.parametrize(("tokens", "number"), [(4, 2), pytest.param(640, 16, marks=pytest.mark.thorough)])
+def test_tokens_bound_the_windows_of_cloning(tokens: int, number: int) -> None:
+    """A window has three."""
+    agent, few, windows, first = bounded(tokens, number)
+    state, key, count = agent.init(SPEC, jax.random.key(0)), jax.random.key(1), jnp.int32(1)
+    assert same(few.clone(state, windows, key, count)[0].head, agent.clone(state, first, key, count)[0].head)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("tokens", "number"), [(4, 2), (640, 16)])
 def test_tokens_bound_the_windows_of_belief(tokens: int, number: int) -> None:
     """The reference learns from the whole batch all the same."""
-    agent, windows, key = BOUNDED, random_windows(SPEC), jax.random.key(1)
-    few = dataclasses.replace(agent, tokens=tokens)
-    first = jax.tree.map(lambda x: x[:number], windows)
-    state, count = agent.init(SPEC, jax.random.key(0)), jnp.int32(1)
+    agent, few, windows, first = bounded(tokens, number)
+    state, key, count = agent.init(SPEC, jax.random.key(0)), jax.random.key(1), jnp.int32(1)
     new, metrics = few.update(state, windows, key, count)
     expected, whole = agent.update(state, windows, key, count)[0], agent.update(state, first, key, count)[0]
     assert same(new.reference, expected.reference)

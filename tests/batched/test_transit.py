@@ -171,7 +171,7 @@ def assert_same(ours: Any, theirs: dict, *, without: tuple[str, ...] = ()) -> No
         np.testing.assert_array_equal(np.asarray(getattr(ours, name)), theirs[name], err_msg=name)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(
     delays(),
     st.lists(st.tuples(st.integers(1, 14), st.booleans()), min_size=STEPS, max_size=STEPS),

@@ -264,7 +264,7 @@ def test_the_page_on_own_tasks(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     assert len(blocks) == 2
     for block in blocks:
-        exec(block.replace("steps=3000", "steps=300, random_steps=150, evaluate_every=150"), {})
+        exec(block.replace("steps=3000", "steps=1500, evaluate_every=750"), {})
     assert {path.parent.parent.name for path in Path("runs").glob("*/*/*")} == {
         "arm-make-gain=0.2-delay4",
         "lambda-gain=0.2-delay4",
