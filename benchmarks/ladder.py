@@ -41,7 +41,6 @@ GOALS = [
     (WHOLE, BASE, ""),
     (WHOLE, "`bpql`, `critic_norm=layer`", "1.15"),
     (WHOLE, "`bpql`, preset `small`", ""),
-    ("`any-age`, preset `small`", "`bpql`, preset `small`", ""),
     ("`any-age`, `critic_norm=none`", BASE, "1.15"),
     ("`any-age`, `batch_size=128`", "`bpql`, `batch_size=128`", ""),
     (WHOLE, "`bpql`, `batch_size=128`, `critic_norm=layer`", "1.15"),
@@ -50,11 +49,9 @@ GOALS = [
     (WHOLE, "`sac`, no delay, `critic_norm=layer`", "0.75"),
     (WHOLE, "`sac`, no delay", ""),
     (TWICE, "`bpql`, its released settings", "1.5"),
-    (TWICE, "`bpql`, `batch_size=128`, `critic_norm=layer`, `updates=2`", "1.15"),
     (TWICE, "`bpql`, `batch_size=128`, `updates=2`", ""),
     (TWICE, "`any-age`, `batch_size=128`", ""),
     (TWICE, WHOLE, ""),
-    (TWICE, "`sac`, no delay, `batch_size=128`, `critic_norm=layer`, `updates=2`", "0.75"),
     (TWICE, "`sac`, no delay, `critic_norm=layer`", ""),
     (TWICE, "`sac`, no delay", ""),
 ]
@@ -137,7 +134,7 @@ def compared_with(result: Result) -> str:
     """Return the arm of any-age that an arm of it is compared with: that with its batches, for that itself WHOLE."""
     if result.condition.agent not in ("any-age", "crossq:ANY_AGE") or name(result) == WHOLE:
         return ""
-    size = result.condition.overrides.get("batch_size") or (128 if result.condition.preset == "small" else None)
+    size = result.condition.overrides.get("batch_size")
     alike = f"{WHOLE}, `batch_size={size}`" if size else WHOLE
     return WHOLE if name(result) == alike else alike
 
