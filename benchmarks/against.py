@@ -1,4 +1,4 @@
-"""Any-age beside each other agent and delay of a task: the tables of differences in docs/algorithms/any-age.md."""
+"""Any-age beside other agents and simpler arms: the tables of differences in docs/algorithms/any-age.md."""
 
 import re
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ from which import results_of
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, delay_order
 from delayrl.report.statistics import Floats
+from delayrl.report.wording import normalised
 
 ENV, OWN = "HalfCheetah-v5", "`any-age`"
 PLAIN = "`any-age`, `critic_norm=none`"
@@ -29,6 +30,25 @@ VARIANTS = (
     "`any-age`, `batch_size=128`, `encoder=mlp`",
 )
 """Shown beside the arms of the first page."""
+SIMPLER = (
+    OWN,
+    "`any-age`, `forecast_error=distance`",
+    "`any-age`, `batch_size=128`",
+    "`any-age`, `encoder=mlp`",
+    "`any-age`, `batch_size=128`, `encoder=mlp`",
+    "`bpql`, `critic_norm=layer`",
+    "`bpql`, `batch_size=128`, `critic_norm=layer`",
+    "`bpql`",
+)
+WHERE: tuple[tuple[str, int | str], ...] = (
+    (ENV, 5),
+    (ENV, 25),
+    (ENV, 50),
+    (ENV, "uniform:1:25"),
+    ("delayrl/Hopper-v4", 25),
+    ("InvertedDoublePendulum-v5", 5),
+)
+"""Arms of one table, any-age with its defaults first, and its tasks and delays."""
 
 
 def section(files: list[Path], env: str = ENV) -> str:
@@ -97,6 +117,49 @@ def added_table(results: list[Result], delay: int = 25) -> str:
             cells += [bold(difference(one[half], two[half] if two.size == one.size else two)) for half in halves]
         body.append([name, *cells])
     return markdown_table(head, body)
+
+
+def simpler(files: list[Path]) -> str:
+    """Return the table of any-age's simpler arms, with what its marks mean."""
+    about = "Normalised returns at the end: 0 is the random policy, 1 SAC without a delay. ↓ is clearly below any-age "
+    about += (
+        "with its defaults, whose line is the first, and (↓) over training alone; ↑ and (↑) are above it, by Welch's "
+    )
+    about += (
+        "interval of 95 %, one for each cell, without a correction for their number. *Arithmetic* is that of a step "
+    )
+    about += "over any-age's. An empty cell has not run."
+    return f"{simpler_table(results_of(map(read_table, files)))}\n\n{about}"
+
+
+def simpler_table(results: list[Result]) -> str:
+    """Return a Markdown table: a row for each of SIMPLER, a column for each of WHERE."""
+    here = front.comparable(results, SIMPLER)
+    chosen = {(front.name(result), (result.place.env, result.place.delay)): result for result in here}
+    body = []
+    for name in SIMPLER:
+        pairs = [(chosen.get((name, case)), chosen.get((OWN, case))) for case in WHERE]
+        price = [
+            f"{one.cost.flops / own.cost.flops:.2f}" for one, own in pairs if one and own and one.cost and own.cost
+        ]
+        body.append([name, price[0] if price else "", *(beside(one, own) for one, own in pairs)])
+    head = (f"{front.short(env)}, Δ = {delay}" for env, delay in WHERE)
+    return markdown_table(["arm", "arithmetic", *head], body)
+
+
+def beside(result: Result | None, own: Result | None) -> str:
+    """Write a normalised return, marked where it is clearly below or above any-age's; empty for what has not run."""
+    if result is None:
+        return ""
+    score = normalised(result.final.mean())
+    if own is None or own is result:
+        return score
+    at_the_end = ("↓", "↑"), result.curves.final, own.curves.final
+    over_training = ("(↓)", "(↑)"), area(result), area(own)
+    for (lower, higher), one, other in (at_the_end, over_training):
+        if welch(one, other) <= 0.05:
+            return f"{score} {higher if one.mean() > other.mean() else lower}"
+    return score
 
 
 def welch(one: Floats, other: Floats) -> float:

@@ -303,6 +303,7 @@ def main() -> None:
     poles = against.section(rows, "InvertedDoublePendulum-v5")
     insert(root / "docs" / "algorithms" / "any-age.md", "against-poles", poles)
     insert(root / "docs" / "algorithms" / "any-age.md", "added-seeds", against.added(rows))
+    insert(root / "docs" / "algorithms" / "any-age.md", "simpler", against.simpler(rows))
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)

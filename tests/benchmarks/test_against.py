@@ -93,3 +93,29 @@ def test_what_cannot_be_known_is_not_clear() -> None:
     assert against.holm([float("nan"), 1e-9]) == [False, True]
     assert against.bold("") == ""
     assert paired(np.array([3.0]), np.array([1.0, 2.0])) == ""
+
+
+def test_simpler_arms_are_marked_where_they_differ() -> None:
+    """The end counts before the whole of training, and what has not run is empty."""
+    ends = {
+        "any-age": ([5.0, 5.5], [10.0, 11.0]),
+        "bpql": ([5.0, 5.5], [1.0, 2.0]),
+        "half": ([1.0, 1.1], [10.0, 11.0]),
+        "random": ([0.0, 0.0], [0.0, 0.0]),
+        "sac": ([20.0, 20.0], [20.0, 20.0]),
+    }
+    cells, rows = [], []
+    for label, (middle, end) in ends.items():
+        agent, delay = {"half": "any-age"}.get(label, label), 0 if label in ("random", "sac") else 5
+        changes = {"id": label, "overrides": {"batch_size": 128} if label == "half" else {}}
+        made, _ = cell(agent, middle * 3, delay, **changes)
+        cells.append(made)
+        for seed, (early, late) in enumerate(zip(middle * 3, end * 3, strict=True)):
+            rows += [row(made, seed, 50_000, early, 0, "agent"), row(made, seed, 100_000, late, 0, "agent")]
+    _, _, *body = against.simpler_table([*summarise(rows, cells).results.values()]).splitlines()
+    shown = {line.split("|")[1].strip(): [text.strip() for text in line.split("|")[3:5]] for line in body}
+    assert list(shown) == [*against.SIMPLER]
+    assert shown["`any-age`"] == ["0.53", ""]
+    assert shown["`bpql`"] == ["0.08 ↓", ""]
+    assert shown["`any-age`, `batch_size=128`"] == ["0.53 (↓)", ""]
+    assert shown["`bpql`, `critic_norm=layer`"] == ["", ""]

@@ -62,6 +62,7 @@ def test_comparisons(tmp_path: Path) -> None:
     poles = figures.against.section(rows, "InvertedDoublePendulum-v5")
     assert section("docs/algorithms/any-age.md", "against-poles") == poles
     assert section("docs/algorithms/any-age.md", "added-seeds") == figures.against.added(rows)
+    assert section("docs/algorithms/any-age.md", "simpler") == figures.against.simpler(rows)
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
     assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])
 
