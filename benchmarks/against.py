@@ -40,55 +40,54 @@ SIMPLER = (
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
     "`bpql`",
 )
-WHERE: tuple[tuple[str, int | str], ...] = (
-    (ENV, 5),
-    (ENV, 25),
-    (ENV, 50),
-    (ENV, "uniform:1:25"),
-    ("delayrl/Hopper-v4", 25),
-    ("InvertedDoublePendulum-v5", 5),
-)
-"""Arms of one table, any-age with its defaults first, and its tasks and delays."""
+WHERE: dict[str, tuple[str, int | str]] = {
+    "5": (ENV, 5),
+    "25": (ENV, 25),
+    "50": (ENV, 50),
+    "uniform:1:25": (ENV, "uniform:1:25"),
+    "Hopper, 25": ("delayrl/Hopper-v4", 25),
+    "pole on a pole, 5": ("InvertedDoublePendulum-v5", 5),
+}
+"""Arms of one table, any-age with its defaults first, and its columns: tasks and delays."""
 
 
 def section(files: list[Path], env: str = ENV) -> str:
-    """Return the table of a task from the cells that have ended, with what its words mean."""
+    """Return the tables of a task from the cells that have ended, with what their words mean."""
     rows = table(results_of(map(read_table, files)), env)
-    about = f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where "
-    about += "no other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are "
-    about += (
-        "Welch's, of 95 %, and bold where they leave out 0. *Arithmetic* is that of a step of any-age over that of "
+    about = (
+        f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where no "
+        "other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are Welch's, "
+        "of 95 %, and bold where they leave out 0. § stays clear after Holm's correction for all differences here at "
+        "the end, or over training. *Arithmetic* is that of a step of any-age over that of the other."
     )
-    about += "the other. § stays clear after Holm's correction for all differences of its column. *Critics* are "
-    about += "any-age's: with layer normalisation, or plain (`critic_norm=none`) beside agents without it."
     if "†" in rows:
         about += " † acts on the true state while it trains; VDPO has `--tokens 1280`."
     return f"{rows}\n\n{about}"
 
 
 def table(results: list[Result], env: str = ENV) -> str:
-    """Return a Markdown table: a row for each delay and other agent that has ended on the preset `matched`."""
+    """Return a Markdown table for each delay: a row for each other agent that has ended on the preset `matched`."""
     chosen: dict[tuple[str, int | str], Result] = {}
     for result in front.comparable(results, VARIANTS):
         if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
-    head = ["delay", "critics", "any-age's end", "other agent", "its end", "any-age minus it, at the end"]
     pairs = []
-    for (name, delay), other in sorted(chosen.items(), key=lambda i: (delay_order(i[0][1]), -area(i[1]).mean())):
-        owns = [OWN] if "any-age" in name or "critic_norm" in name else [OWN, PLAIN]
-        pairs += [
-            (own, name, delay, chosen[own, delay], other) for own in owns if (own, delay) in chosen and own != name
-        ]
+    for own_name in (OWN, PLAIN):
+        for (name, delay), other in chosen.items():
+            alike = own_name == OWN or not ("any-age" in name or "critic_norm" in name)
+            if alike and (own_name, delay) in chosen and own_name != name:
+                pairs.append((delay, own_name, name, chosen[own_name, delay], other))
+    pairs.sort(key=lambda pair: (delay_order(pair[0]), pair[1], -area(pair[-1]).mean()))
     ends = holm([welch(own.curves.final, other.curves.final) for *_, own, other in pairs])
     areas = holm([welch(area(own), area(other)) for *_, own, other in pairs])
-    body = []
-    for (own_name, name, delay, own, other), end, whole in zip(pairs, ends, areas, strict=True):
-        cells = [str(delay), "plain" if own_name == PLAIN else "layer", ended_at(own), name, ended_at(other)]
-        cells += [bold(difference(own.curves.final, other.curves.final)) + " §" * end]
+    parts: dict[str, list[list[str]]] = {}
+    for (delay, own_name, name, own, other), end, whole in zip(pairs, ends, areas, strict=True):
+        cells = [name, ended_at(other), bold(difference(own.curves.final, other.curves.final)) + " §" * end]
         cells += [bold(difference(area(own), area(other))) + " §" * whole]
         ratio = f"{own.cost.flops / other.cost.flops:.2f}" if own.cost and other.cost else ""
-        body.append([*cells, ratio])
-    return markdown_table([*head, "over training", "arithmetic"], body)
+        parts.setdefault(f"**Δ = {delay}**: {own_name} ends at {ended_at(own)}.", []).append([*cells, ratio])
+    head = ["other agent", "ends at", "any-age minus it, at the end", "over training", "arithmetic"]
+    return "\n\n".join(f"{title}\n\n{markdown_table(head, body)}" for title, body in parts.items())
 
 
 def added(files: list[Path]) -> str:
@@ -121,14 +120,12 @@ def added_table(results: list[Result], delay: int = 25) -> str:
 
 def simpler(files: list[Path]) -> str:
     """Return the table of any-age's simpler arms, with what its marks mean."""
-    about = "Normalised returns at the end: 0 is the random policy, 1 SAC without a delay. ↓ is clearly below any-age "
-    about += (
-        "with its defaults, whose line is the first, and (↓) over training alone; ↑ and (↑) are above it, by Welch's "
+    about = (
+        "Delays in steps, on HalfCheetah if no task is named. The cells are normalised returns at the end: 0 is the "
+        "random policy, 1 SAC without a delay. ↓ is clearly below any-age with its defaults, whose line is the first, "
+        "and (↓) over training alone; ↑ and (↑) are above it, by Welch's interval of 95 % for each cell, without a "
+        "correction for their number. *Arithmetic* is that of a step over any-age's. An empty cell has not run."
     )
-    about += (
-        "interval of 95 %, one for each cell, without a correction for their number. *Arithmetic* is that of a step "
-    )
-    about += "over any-age's. An empty cell has not run."
     return f"{simpler_table(results_of(map(read_table, files)))}\n\n{about}"
 
 
@@ -138,13 +135,11 @@ def simpler_table(results: list[Result]) -> str:
     chosen = {(front.name(result), (result.place.env, result.place.delay)): result for result in here}
     body = []
     for name in SIMPLER:
-        pairs = [(chosen.get((name, case)), chosen.get((OWN, case))) for case in WHERE]
-        price = [
-            f"{one.cost.flops / own.cost.flops:.2f}" for one, own in pairs if one and own and one.cost and own.cost
-        ]
+        pairs = [(chosen.get((name, case)), chosen.get((OWN, case))) for case in WHERE.values()]
+        costs = [(one.cost, own.cost) for one, own in pairs if one and own]
+        price = [f"{one.flops / own.flops:.2f}" for one, own in costs if one and own]
         body.append([name, price[0] if price else "", *(beside(one, own) for one, own in pairs)])
-    head = (f"{front.short(env)}, Δ = {delay}" for env, delay in WHERE)
-    return markdown_table(["arm", "arithmetic", *head], body)
+    return markdown_table(["arm", "arithmetic", *WHERE], body)
 
 
 def beside(result: Result | None, own: Result | None) -> str:

@@ -31,15 +31,13 @@ def test_rows_are_what_has_ended_at_the_same_delay() -> None:
     ]
     cells.append((standing("dcac", against.ENV, 25, 5, steps=100_000, preset="matched", state="todo", step=0), []))
     results = summarise(rows, [made for made, _ in cells]).results.values()
-    _, _, *body = against.table([*results]).splitlines()
+    title, _, _, _, *body = against.table([*results]).splitlines()
+    assert title == "**Δ = 25**: `any-age` ends at 12 ± 1 (10 seeds)."
     shown = [[text.strip() for text in line.strip("|").split("|")] for line in body]
-    assert [line[:5] for line in shown] == [
-        ["25", "layer", "12 ± 1 (10 seeds)", "`vdpo` †", "12 ± 2"],
-        ["25", "layer", "12 ± 1 (10 seeds)", "`bpql`", "3 ± 2"],
-    ]
-    assert not shown[0][5].startswith("**")
-    assert shown[1][5].startswith("**+9 (+")
-    assert [line[5].endswith("§") for line in shown] == [False, True]
+    assert [line[:2] for line in shown] == [["`vdpo` †", "12 ± 2"], ["`bpql`", "3 ± 2"]]
+    assert not shown[0][2].startswith("**")
+    assert shown[1][2].startswith("**+9 (+")
+    assert [line[2].endswith("§") for line in shown] == [False, True]
 
 
 def test_seeds_that_were_added_stand_apart() -> None:
@@ -59,13 +57,14 @@ def test_equal_critics_are_compared_too() -> None:
     cells = [cell("any-age", five, 25), cell("any-age", five, 25, id="plain", overrides={"critic_norm": "none"})]
     cells += [cell("bpql", five, 25, id="a"), cell("bpql", five, 25, id="b", overrides={"critic_norm": "layer"})]
     rows = [row(made, s, made[0].condition.steps, x, 0, "agent") for made, ends in cells for s, x in enumerate(ends)]
-    _, _, *body = against.table([*summarise(rows, [made for made, _ in cells]).results.values()]).splitlines()
-    shown = {tuple(text.strip() for text in line.strip("|").split("|"))[1:4:2] for line in body}
+    text = against.table([*summarise(rows, [made for made, _ in cells]).results.values()])
+    shown = {
+        part.split(" ends")[0]: {line.split(" | ")[0] for line in part.splitlines()[4:] if line}
+        for part in text.split("**Δ = 25**: ")[1:]
+    }
     assert shown == {
-        ("layer", "`bpql`"),
-        ("plain", "`bpql`"),
-        ("layer", "`bpql`, `critic_norm=layer`"),
-        ("layer", against.PLAIN),
+        "`any-age`": {"| `bpql`", "| `bpql`, `critic_norm=layer`", f"| {against.PLAIN}"},
+        against.PLAIN: {"| `bpql`"},
     }
 
 
