@@ -205,11 +205,13 @@ def draw(arms: list[Result], out: Path) -> None:
     bpql = [arm for arm in arms if arm.condition.agent == "bpql"]
     rest = [arm for arm in arms if arm.condition.agent not in ("sac", "bpql")]
     for axes, title, own in zip(panels, ("any-age and its arms", "BPQL and its arms"), (rest, bpql), strict=True):
-        greys = itertools.cycle((STYLES["sac"][0], STYLES["random"][0]))
-        tab = itertools.cycle(pyplot.get_cmap("tab10").colors)
-        looks = [*zip(sac, greys, strict=False), *zip(own, tab, strict=False)]
-        for result, colour in looks:
-            curve(axes, *result.curves, colour, each=False).set_label(name(result).replace("`", ""))
+        greys = itertools.product("-", (STYLES["sac"][0], STYLES["random"][0]))
+        tab = itertools.product(
+            ("-", "--"), pyplot.get_cmap("tab10").colors
+        )  # the eleventh arm and those after it dashed
+        for result, (dashes, colour) in [*zip(sac, greys, strict=False), *zip(own, tab, strict=False)]:
+            line = curve(axes, *result.curves, colour, each=False)
+            line.set(label=name(result).replace("`", ""), linestyle=dashes)
         axes.set_title(f"{title}, 25 steps late", fontsize=10)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize=8)
     panels[0].set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
