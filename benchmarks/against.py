@@ -153,7 +153,7 @@ def beside(result: Result | None, own: Result | None) -> str:
     over_training = ("(↓)", "(↑)"), area(result), area(own)
     for (lower, higher), one, other in (at_the_end, over_training):
         if welch(one, other) <= 0.05:
-            return f"{score} {higher if one.mean() > other.mean() else lower}"
+            return f"{score}&nbsp;{higher if one.mean() > other.mean() else lower}"
     return score
 
 

@@ -115,6 +115,6 @@ def test_simpler_arms_are_marked_where_they_differ() -> None:
     shown = {line.split("|")[1].strip(): [text.strip() for text in line.split("|")[3:5]] for line in body}
     assert list(shown) == [*against.SIMPLER]
     assert shown["`any-age`"] == ["0.53", ""]
-    assert shown["`bpql`"] == ["0.08 ↓", ""]
-    assert shown["`any-age`, `batch_size=128`"] == ["0.53 (↓)", ""]
+    assert shown["`bpql`"] == ["0.08&nbsp;↓", ""]
+    assert shown["`any-age`, `batch_size=128`"] == ["0.53&nbsp;(↓)", ""]
     assert shown["`bpql`, `critic_norm=layer`"] == ["", ""]
