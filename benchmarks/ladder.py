@@ -206,9 +206,7 @@ def draw(arms: list[Result], out: Path) -> None:
     rest = [arm for arm in arms if arm.condition.agent not in ("sac", "bpql")]
     for axes, title, own in zip(panels, ("any-age and its arms", "BPQL and its arms"), (rest, bpql), strict=True):
         greys = itertools.product("-", (STYLES["sac"][0], STYLES["random"][0]))
-        tab = itertools.product(
-            ("-", "--"), pyplot.get_cmap("tab10").colors
-        )  # the eleventh arm and those after it dashed
+        tab = itertools.product(("-", "--"), pyplot.get_cmap("tab10").colors)  # ten solid lines, then dashed ones
         for result, (dashes, colour) in [*zip(sac, greys, strict=False), *zip(own, tab, strict=False)]:
             line = curve(axes, *result.curves, colour, each=False)
             line.set(label=name(result).replace("`", ""), linestyle=dashes)

@@ -250,7 +250,6 @@ def test_a_run_goes_on_although_the_newest_checkpoint_of_its_source_is_damaged(t
     assert train("bpql", tmp_path / "new", steps=200, start_from=tmp_path / "old").config == new.config
 
 
-@pytest.mark.thorough
 def test_networks_of_another_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Those whose sizes fit, before the first update; the notes and the configuration say which run it was."""
     old = train("bpql", tmp_path / "old", steps=200)

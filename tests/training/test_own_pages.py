@@ -43,7 +43,6 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.thorough  # tests/users/agents.py does the same from a wheel
 def test_an_installed_package(site: Path, capsys) -> None:
     """Its agent and its law are trained from the command line in another process, then resumed, played and exported."""
     words = ["train", "late-ddpg", "--width", "16", "--env", "InvertedPendulum-v5", "--delay", "burst(steps=3)"]

@@ -255,7 +255,6 @@ def test_a_bundle_of_an_own_task(tmp_path: Path) -> None:
     np.testing.assert_allclose(action, policy.act(np.ones(1), info), atol=1e-5)
 
 
-@pytest.mark.thorough
 def test_the_page_on_own_tasks(tmp_path: Path, monkeypatch) -> None:
     """Its Python runs as it stands: the first block is the module that the others import."""
     page = (Path(__file__).parents[2] / "docs" / "own-task.md").read_text()

@@ -148,7 +148,7 @@ def test_killed_and_resumed_is_uninterrupted(agent: str, at: int, options: dict,
 @pytest.mark.parametrize(
     ("agent", "block"),
     [
-        pytest.param("bpql", 4, marks=pytest.mark.thorough),
+        ("bpql", 4),
         pytest.param("bpql", 1, marks=pytest.mark.slow),
         pytest.param("vdpo", 10, marks=pytest.mark.slow),
     ],
