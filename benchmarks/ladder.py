@@ -6,6 +6,7 @@ begin with the same random actions, and with the same actor if they have one enc
 
 import functools
 import itertools
+import textwrap
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -33,7 +34,7 @@ read_table = functools.cache(bench.read_table)
 """Several sections of the pages read the same files."""
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,480."""
-BASE, WHOLE = "`bpql`", "`any-age`"
+BASE, WHOLE, SAC = "`bpql`", "`any-age`", "`sac`, no delay"
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
 GOALS = [
@@ -199,19 +200,29 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
 
 
 def draw(arms: list[Result], out: Path) -> None:
-    """Draw the mean curves of the arms: a panel for any-age and its variants, one for BPQL's, with SAC in both."""
-    figure, panels = pyplot.subplots(1, 2, figsize=(10, 5.6), sharey=True, layout="constrained")
-    sac = [arm for arm in arms if arm.condition.agent == "sac"]
-    bpql = [arm for arm in arms if arm.condition.agent == "bpql"]
-    rest = [arm for arm in arms if arm.condition.agent not in ("sac", "bpql")]
-    for axes, title, own in zip(panels, ("any-age and its arms", "BPQL and its arms"), (rest, bpql), strict=True):
-        greys = itertools.product("-", (STYLES["sac"][0], STYLES["random"][0]))
-        tab = itertools.product(("-", "--"), pyplot.get_cmap("tab10").colors)  # ten solid lines, then dashed ones
-        for result, (dashes, colour) in [*zip(sac, greys, strict=False), *zip(own, tab, strict=False)]:
-            line = curve(axes, *result.curves, colour, each=False)
-            line.set(label=name(result).replace("`", ""), linestyle=dashes)
-        axes.set_title(f"{title}, 25 steps late", fontsize=10)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, fontsize=8)
-    panels[0].set_ylim(bottom=min(0, float(np.min([r.curves.mean.min() for r in arms]))))
+    """Draw a panel for each arm with a delay, in the order of the table: its seeds and their mean, beside two others.
+
+    Dotted is SAC without a delay, dashed the arm of any-age that it is compared with, else BPQL.
+    """
+    late, known = [arm for arm in arms if arm.condition.delay != 0], {name(arm): arm for arm in arms}
+    rows, columns = -(-len(late) // 5), 5
+    figure, panels = pyplot.subplots(
+        rows, columns, figsize=(11, 1.9 * rows), sharex=True, sharey=True, squeeze=False, layout="constrained"
+    )
+    for axes, arm in itertools.zip_longest(panels.flat, late):
+        if arm is None:
+            axes.set_axis_off()
+            continue
+        for other, dashes in ((SAC, ":"), (compared_with(arm) or BASE, "--")):
+            if other in known and known[other] is not arm:
+                axes.plot(known[other].curves.steps, known[other].curves.mean, dashes, color="#444444", linewidth=1.2)
+        colour = STYLES["bpql" if arm.condition.agent == "bpql" else "any-age"][0]
+        curve(axes, *arm.curves, colour)
+        axes.set(xlabel="", ylabel="", xticks=[0, 50_000, 100_000])
+        axes.set_title(textwrap.fill(name(arm).replace("`", ""), 32, break_long_words=False), fontsize=8)
+        axes.tick_params(labelsize=8)
+        axes.xaxis.set_major_formatter(lambda step, _: f"{step / 1000:.0f}")
+    figure.supxlabel("thousands of environment steps", fontsize=9)
+    figure.supylabel("return", fontsize=9)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)

@@ -108,12 +108,9 @@ def draw(runs: Runs, out: Path) -> None:
     pyplot.close(figure)
 
 
-def curve(
-    axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any, *, each: bool = True
-) -> Line2D:
-    """Draw return against steps: the mean over seeds, which is returned, and if asked for a thin line for each seed."""
-    if each:
-        axes.plot(steps, returns.T, color=colour, alpha=0.2, linewidth=0.8)
+def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any) -> Line2D:
+    """Draw return against steps: a thin line for each seed, and their mean, which is returned."""
+    axes.plot(steps, returns.T, color=colour, alpha=0.2, linewidth=0.8)
     (mean,) = axes.plot(steps, returns.mean(0), color=colour, linewidth=2.2)
     axes.set(xlabel="environment steps", ylabel="return")
     axes.grid(alpha=0.25)
