@@ -1,13 +1,12 @@
 """Any-age beside other agents and simpler arms: the tables of differences in docs/algorithms/any-age.md."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import front
 import numpy as np
 from ladder import area, read_table
-from learning.curves import difference, spread
+from learning.curves import bold, difference, spread
 from scipy import stats
 from which import results_of
 
@@ -175,11 +174,3 @@ def holm(values: Sequence[float]) -> list[bool]:
 def ended_at(result: Result) -> str:
     """Write the returns at the end, with the number of seeds if it is another than usual."""
     return spread(result.curves.final) + (f" ({result.runs} seeds)" if result.runs != front.SEEDS else "")
-
-
-def bold(text: str) -> str:
-    """Write in bold a difference whose interval leaves out 0; a difference without an interval is empty."""
-    if not text:
-        return ""
-    low, high = re.findall(r"[-+][\d,]+", text)[1:]
-    return f"**{text}**" if low[0] == high[0] else text

@@ -1,7 +1,7 @@
 """The ladder of any-age: what each part brings, from the rows of the grid `any-age-ladder`; cells that have ended.
 
-All arms have the seeds 0 to n - 1. An arm of any-age is compared with any-age that has its batches. Arms of one seed
-begin with the same random actions, and with the same actor if they have one encoder.
+All arms have the seeds 0 to n - 1. An arm's *base*, with which it is compared, is any-age with its batches, or BPQL.
+Arms of one seed begin with the same random actions, and with the same actor if they have one encoder.
 """
 
 import functools
@@ -14,7 +14,7 @@ from typing import Any
 
 import jsonl
 import numpy as np
-from learning.curves import curve, difference, spread
+from learning.curves import bold, curve, difference, spread
 from matplotlib import pyplot
 from scipy import stats
 
@@ -131,35 +131,33 @@ def arm(condition: Condition) -> str:
     return ", ".join([*words, *(f"`{k}={v}`" for k, v in sorted(condition.overrides.items()) if k != "precision")])
 
 
-def compared_with(result: Result) -> str:
-    """Return the arm of any-age that an arm of it is compared with: that with its batches, for that itself WHOLE."""
-    if result.condition.agent not in ("any-age", "crossq:ANY_AGE") or name(result) == WHOLE:
+def base_of(result: Result) -> str:
+    """Return the arm that an arm is compared with: any-age with its batches, for those BPQL; none for BPQL and SAC."""
+    if result.condition.agent == "sac" or name(result) == BASE:
         return ""
     size = result.condition.overrides.get("batch_size")
     alike = f"{WHOLE}, `batch_size={size}`" if size else WHOLE
+    if result.condition.agent == "bpql" or name(result) == WHOLE:
+        return BASE
     return WHOLE if name(result) == alike else alike
 
 
 def table(results: list[Result], slower: Mapping[str, float] | None = None) -> str:
-    """Return a Markdown table of the arms, compared with BPQL on the same SAC, and any-age with its other arms.
+    """Return a Markdown table of the arms, each minus its base seed by seed.
 
     `slower` has the time of each arm's update over that of BPQL's.
     """
     arms, slower = {name(r): r for r in results}, slower or {}
-    base = arms.get(BASE)
-    head = ["arm", "seeds", "over training", "times BPQL's", "minus BPQL's"]
-    head += ["`any-age` (with such batches) minus this arm, by seed", "at the end", f"above {AWAY:,}", "GFLOP"]
-    head += ["update time / BPQL's"]
+    head = ["arm", "over training", "minus its base", "at the end", "minus its base", f"above {AWAY:,}", "GFLOP"]
     body = []
     for result in results:
-        own, final, other = area(result), result.curves.final, area(base) if base and base is not result else None
-        cells = [name(result), str(result.runs), spread(own)]
-        cells += ["", ""] if other is None else [ratio(own, other, result), difference(own, other)]
-        whole = arms.get(compared_with(result))
-        cells += [paired(area(whole), own) if whole else ""]
-        cells += [spread(final), f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
+        cells, base = [name(result)], arms.get(base_of(result))
+        for values in (area, lambda arm: arm.curves.final):
+            cells += [spread(values(result)), bold(paired(values(result), values(base))) if base else ""]
+        final = result.curves.final
+        cells += [f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
         body.append([*cells, f"{slower[name(result)]:.2f}" if name(result) in slower else ""])
-    return markdown_table(head, body)
+    return markdown_table([*head, "update time"], body)
 
 
 def update_times(file: Path) -> dict[str, float]:
@@ -202,7 +200,7 @@ def paired(one: statistics.Floats, other: statistics.Floats) -> str:
 def draw(arms: list[Result], out: Path) -> None:
     """Draw a panel for each arm with a delay, in the order of the table: its seeds and their mean, beside two others.
 
-    Dotted is SAC without a delay, dashed the arm of any-age that it is compared with, else BPQL.
+    Dotted is SAC without a delay, dashed the arm's base.
     """
     late, known = [arm for arm in arms if arm.condition.delay != 0], {name(arm): arm for arm in arms}
     rows, columns = -(-len(late) // 5), 5
@@ -213,8 +211,8 @@ def draw(arms: list[Result], out: Path) -> None:
         if arm is None:
             axes.set_axis_off()
             continue
-        for other, dashes in ((SAC, ":"), (compared_with(arm) or BASE, "--")):
-            if other in known and known[other] is not arm:
+        for other, dashes in ((SAC, ":"), (base_of(arm), "--")):
+            if other in known:
                 axes.plot(known[other].curves.steps, known[other].curves.mean, dashes, color="#444444", linewidth=1.2)
         colour = STYLES["bpql" if arm.condition.agent == "bpql" else "any-age"][0]
         curve(axes, *arm.curves, colour)

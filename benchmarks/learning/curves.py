@@ -1,6 +1,7 @@
 """The base beside other libraries' SAC: reads the rows of both, compares areas under curves, draws them."""
 
 import json
+import re
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,14 @@ def draw(runs: Runs, out: Path) -> None:
     figure.legend(lines.values(), lines, loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(out, dpi=130)
     pyplot.close(figure)
+
+
+def bold(text: str) -> str:
+    """Write in bold a difference whose interval leaves out 0; a difference without an interval is empty."""
+    if not text:
+        return ""
+    low, high = re.findall(r"[-+][\d,]+", text)[1:]
+    return f"**{text}**" if low[0] == high[0] else text
 
 
 def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any) -> Line2D:

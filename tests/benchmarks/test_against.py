@@ -6,6 +6,7 @@ import against
 import numpy as np
 import pytest
 from ladder import paired
+from learning.curves import bold
 from synthetic import row, standing
 
 from delayrl.report.summary import summarise
@@ -84,13 +85,13 @@ def test_holms_correction(values: list[float], clear: list[bool]) -> None:
     ("text", "clear"), [("+9 (-1 to +19)", False), ("-9 (-19 to -1)", True), ("+9 (+1 to +1,900)", True)]
 )
 def test_what_leaves_out_0_is_bold(text: str, clear: bool) -> None:
-    assert against.bold(text) == (f"**{text}**" if clear else text)
+    assert bold(text) == (f"**{text}**" if clear else text)
 
 
 def test_what_cannot_be_known_is_not_clear() -> None:
     """One seed has no interval, and no p-value."""
     assert against.holm([float("nan"), 1e-9]) == [False, True]
-    assert against.bold("") == ""
+    assert bold("") == ""
     assert paired(np.array([3.0]), np.array([1.0, 2.0])) == ""
 
 

@@ -25,26 +25,31 @@ def test_the_ladder_pairs_seeds_by_place() -> None:
         ladder.check_seeds([cells[0], cells[2]])
 
 
-def test_the_ladder_compares_with_bpql() -> None:
-    """The mean of an arm's curves over that of BPQL's, and how many seeds got away."""
+def test_the_ladder_compares_each_arm_with_its_base() -> None:
+    """Seed by seed, over training and at the end, with how many seeds got away."""
     base = result("bpql", 25, [[1000.0, 1000.0], [1200.0, 1200.0]])
-    arm = result("any-age", 25, [[2000.0, 2000.0], [2400.0, 1400.0]], pull_weight=0.0)
-    lines = ladder.table([arm, base], {"`any-age`, `pull_weight=0.0`": 1.5}).splitlines()[2:]
-    cells = [line.strip("| ").split(" | ") for line in lines]
-    assert cells[0][:2] == ["`any-age`, `pull_weight=0.0`", "2"]
-    own = ladder.area(arm).mean()
-    assert float(cells[0][3]) == pytest.approx((own + 100) / 1200, abs=0.01)  # above the random policy's -100
-    assert cells[0][4].startswith(f"+{own - 1100:,.0f} (")
-    assert cells[0][7:] == ["1 of 2", "1.23", "1.50"]
-    assert cells[1][3:5] == ["", ""]
-    assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
     whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
-    line = ladder.table([whole, arm, base]).splitlines()[3].strip("| ").split(" | ")
-    assert line[5] == "+300 (-2,241 to +2,841)"  # gaps of 500 and 100, t = 12.706; the third seed has no other
+    arm = result("any-age", 25, [[2000.0, 2000.0], [2400.0, 1400.0]], pull_weight=0.0)
+    rows = ladder.table([whole, arm, base], {"`any-age`, `pull_weight=0.0`": 1.5}).splitlines()[2:]
+    lines = [line.strip("| ").split(" | ") for line in rows]
+    assert lines[1][0] == "`any-age`, `pull_weight=0.0`"
+    assert lines[1][2] == "-300 (-2,841 to +2,241)"  # gaps of 500 and 100, t = 12.706; the third seed has no other
+    assert lines[1][4] == "-300 (-2,841 to +2,241)"
+    assert lines[1][5:] == ["1 of 2", "1.23", "1.50"]
+    assert lines[0][2] == "+1,150 (-3,297 to +5,597)"  # over training gaps of 1,500 and 800 from BPQL
+    assert lines[0][4] == "+900 (-6,724 to +8,524)"  # at the end 1,500 and 300
+    assert [lines[2][2], lines[2][4]] == ["", ""]
+    assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
     smaller = result("any-age", 25, [[2000.0, 2000.0], [2000.0, 1000.0]], batch_size=128)
     changed = result("any-age", 25, [[1000.0, 1000.0], [1000.0, 1000.0]], batch_size=128, n_steps=5)
     lines = [line.strip("| ").split(" | ") for line in ladder.table([whole, smaller, changed]).splitlines()[2:]]
-    assert [line[5].split(" ")[0] for line in lines] == ["", "+500", "+750"]  # each with any-age that has its batches
+    assert [line[2].strip("*").split(" ")[0] for line in lines] == [
+        "",
+        "-500",
+        "-750",
+    ]  # each from any-age that has its batches
+    assert ladder.base_of(result("bpql", 25, [[0.0]], critic_norm="layer")) == "`bpql`"
+    assert ladder.base_of(result("sac", 0, [[0.0]], critic_norm="layer")) == ""
 
 
 def test_update_times_are_paired_by_round(tmp_path: Path) -> None:
