@@ -42,12 +42,9 @@ def test_the_ladder_compares_each_arm_with_its_base() -> None:
     assert ladder.name(result("sac", 0, [[0.0], [1.0]])) == "`sac`, no delay"
     smaller = result("any-age", 25, [[2000.0, 2000.0], [2000.0, 1000.0]], batch_size=128)
     changed = result("any-age", 25, [[1000.0, 1000.0], [1000.0, 1000.0]], batch_size=128, n_steps=5)
-    lines = [line.strip("| ").split(" | ") for line in ladder.table([whole, smaller, changed]).splitlines()[2:]]
-    assert [line[2].strip("*").split(" ")[0] for line in lines] == [
-        "",
-        "-500",
-        "-750",
-    ]  # each from any-age that has its batches
+    rows = ladder.table([whole, smaller, changed]).splitlines()[2:]
+    gaps = [row.strip("| ").split(" | ")[2].strip("*").split(" ")[0] for row in rows]
+    assert gaps == ["", "-500", "-750"]  # each from any-age that has its batches
     assert ladder.base_of(result("bpql", 25, [[0.0]], critic_norm="layer")) == "`bpql`"
     assert ladder.base_of(result("sac", 0, [[0.0]], critic_norm="layer")) == ""
 
