@@ -133,13 +133,14 @@ def arm(condition: Condition) -> str:
 
 def base_of(result: Result) -> str:
     """Return the arm that an arm is compared with: any-age with its batches, for those BPQL; none for BPQL and SAC."""
-    if result.condition.agent == "sac" or name(result) == BASE:
+    agent, own = result.condition.agent, name(result)
+    if agent == "sac" or own == BASE:
         return ""
+    if agent == "bpql" or own == WHOLE:
+        return BASE
     size = result.condition.overrides.get("batch_size")
     alike = f"{WHOLE}, `batch_size={size}`" if size else WHOLE
-    if result.condition.agent == "bpql" or name(result) == WHOLE:
-        return BASE
-    return WHOLE if name(result) == alike else alike
+    return WHOLE if own == alike else alike
 
 
 def table(results: list[Result], slower: Mapping[str, float] | None = None) -> str:
@@ -152,7 +153,7 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
     body = []
     for result in results:
         cells, base = [name(result)], arms.get(base_of(result))
-        for values in (area, lambda arm: arm.curves.final):
+        for values in (area, lambda one: one.curves.final):
             cells += [spread(values(result)), bold(paired(values(result), values(base))) if base else ""]
         final = result.curves.final
         cells += [f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
@@ -202,22 +203,22 @@ def draw(arms: list[Result], out: Path) -> None:
 
     Dotted is SAC without a delay, dashed the arm's base.
     """
-    late, known = [arm for arm in arms if arm.condition.delay != 0], {name(arm): arm for arm in arms}
+    late, known = [r for r in arms if r.condition.delay != 0], {name(r): r for r in arms}
     rows, columns = -(-len(late) // 5), 5
     figure, panels = pyplot.subplots(
         rows, columns, figsize=(11, 1.9 * rows), sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
-    for axes, arm in itertools.zip_longest(panels.flat, late):
-        if arm is None:
+    for axes, result in itertools.zip_longest(panels.flat, late):
+        if result is None:
             axes.set_axis_off()
             continue
-        for other, dashes in ((SAC, ":"), (base_of(arm), "--")):
+        for other, dashes in ((SAC, ":"), (base_of(result), "--")):
             if other in known:
                 axes.plot(known[other].curves.steps, known[other].curves.mean, dashes, color="#444444", linewidth=1.2)
-        colour = STYLES["bpql" if arm.condition.agent == "bpql" else "any-age"][0]
-        curve(axes, *arm.curves, colour)
+        colour = STYLES["bpql" if result.condition.agent == "bpql" else "any-age"][0]
+        curve(axes, *result.curves, colour)
         axes.set(xlabel="", ylabel="", xticks=[0, 50_000, 100_000])
-        axes.set_title(textwrap.fill(name(arm).replace("`", ""), 32, break_long_words=False), fontsize=8)
+        axes.set_title(textwrap.fill(name(result).replace("`", ""), 32, break_long_words=False), fontsize=8)
         axes.tick_params(labelsize=8)
         axes.xaxis.set_major_formatter(lambda step, _: f"{step / 1000:.0f}")
     figure.supxlabel("thousands of environment steps", fontsize=9)
