@@ -218,7 +218,7 @@ def draw(arms: list[Result], out: Path) -> None:
         colour = STYLES["bpql" if result.condition.agent == "bpql" else "any-age"][0]
         curve(axes, *result.curves, colour)
         axes.set(xlabel="", ylabel="", xticks=[0, 50_000, 100_000])
-        axes.set_title(textwrap.fill(name(result).replace("`", ""), 32, break_long_words=False), fontsize=8)
+        axes.set_title(textwrap.fill(name(result).replace("`", ""), 30, break_long_words=False), fontsize=8)
         axes.tick_params(labelsize=8)
         axes.xaxis.set_major_formatter(lambda step, _: f"{step / 1000:.0f}")
     figure.supxlabel("thousands of environment steps", fontsize=9)
