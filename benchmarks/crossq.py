@@ -1,4 +1,4 @@
-"""CrossQ's critics in any-age: a side arm of the ladder, and an agent of one's own.
+"""CrossQ's critics in any-age, BPQL and SAC without a delay: side arms of the ladder, and agents of one's own.
 
 Paper: Bhatt et al., ICLR 2024. Batch norm before every layer of the critics takes the place of layer norm, and there
 are no target critics: one pass over (s_t, a_t) and (s_{t+k}, a') gives values and targets, both normalised by the
@@ -147,16 +147,24 @@ class CrossQ(SAC):
         return state, {"critic_loss": value, "q": q, "temperature": temperature}
 
 
-def _with_crossq(preset: Preset) -> Preset:
+def with_crossq(agent: SAC) -> CrossQ:
+    """Return the agent with CrossQ's critics in place of its own, and nothing else changed."""
+    kept = {field.name for field in fields(SAC)} - {"critic_norm", "target_rate"}
+    return CrossQ(**{name: getattr(agent, name) for name in kept})
+
+
+def _changed(preset: Preset) -> Preset:
     agent = preset.agent
-    assert isinstance(agent, AnyAge)
-    ours = {field.name for field in fields(SAC)} - {"critic_norm", "target_rate"}
-    sac = {name: getattr(agent.bpql, name) for name in ours}
-    return preset._replace(agent=replace(agent, bpql=CrossQ(**sac)))
+    if isinstance(agent, AnyAge):
+        return preset._replace(agent=replace(agent, bpql=with_crossq(agent.bpql)))
+    assert isinstance(agent, SAC)
+    return preset._replace(agent=with_crossq(agent))
 
 
-ANY_AGE = Registration(
-    "any-age with CrossQ's critics: batch norm, and no target critics",
-    "Bhatt et al., ICLR 2024",
-    {name: _with_crossq(preset) for name, preset in AGENTS["any-age"].presets.items()},
-)
+def _registered(name: str) -> Registration:
+    presets = {preset: _changed(values) for preset, values in AGENTS[name].presets.items()}
+    words = f"{name} with CrossQ's critics: batch norm, and no target critics"
+    return Registration(words, "Bhatt et al., ICLR 2024", presets)
+
+
+ANY_AGE, BPQL, DELAY_FREE = (_registered(name) for name in ("any-age", "bpql", "sac"))

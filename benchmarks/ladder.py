@@ -1,4 +1,4 @@
-"""The ladder of any-age: what each part brings, from the rows of the grid `any-age-ladder`; cells that have ended.
+"""The ladder of any-age: what each part brings, from the rows of its grids; cells that have ended.
 
 All arms have the seeds 0 to n - 1. An arm's *base*, with which it is compared, is any-age with its batches, or BPQL.
 Arms of one seed begin with the same random actions, and with the same actor if they have one encoder.
@@ -35,8 +35,10 @@ read_table = functools.cache(bench.read_table)
 AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,480."""
 BASE, WHOLE, SAC = "`bpql`", "`any-age`", "`sac`, no delay"
+HALF = "`bpql`, `batch_size=128`, `critic_norm=layer`"
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
+CROSSQ = "`crossq:ANY_AGE`, `batch_size=128`"
 GOALS = [
     (WHOLE, "`bpql`, its released settings", "1.5"),
     (WHOLE, BASE, ""),
@@ -44,9 +46,9 @@ GOALS = [
     (WHOLE, "`bpql`, preset `small`", ""),
     ("`any-age`, `critic_norm=none`", BASE, "1.15"),
     ("`any-age`, `batch_size=128`", "`bpql`, `batch_size=128`", ""),
-    (WHOLE, "`bpql`, `batch_size=128`, `critic_norm=layer`", "1.15"),
-    ("`any-age`, `batch_size=128`", "`bpql`, `batch_size=128`, `critic_norm=layer`", "1.15"),
-    ("`any-age`, `batch_size=128`, `encoder=mlp`", "`bpql`, `batch_size=128`, `critic_norm=layer`", ""),
+    (WHOLE, HALF, "1.15"),
+    ("`any-age`, `batch_size=128`", HALF, "1.15"),
+    ("`any-age`, `batch_size=128`, `encoder=mlp`", HALF, ""),
     (WHOLE, "`sac`, no delay, `critic_norm=layer`", "0.75"),
     (WHOLE, "`sac`, no delay", ""),
     (TWICE, "`bpql`, its released settings", "1.5"),
@@ -55,18 +57,22 @@ GOALS = [
     (TWICE, WHOLE, ""),
     (TWICE, "`sac`, no delay, `critic_norm=layer`", ""),
     (TWICE, "`sac`, no delay", ""),
+    (CROSSQ, "`any-age`, `batch_size=128`", ""),
+    (CROSSQ, HALF, ""),
+    (CROSSQ, "`crossq:BPQL`, `batch_size=128`", "1.15"),
+    (CROSSQ, "`sac`, no delay, `critic_norm=layer`", ""),
+    (CROSSQ, "`crossq:DELAY_FREE`, no delay", "0.75"),
 ]
 """Two arms, and the ratio of their returns that is aimed at."""
 
 
 def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     """Draw the curves; return the tables of all arms, with what made them, and of the goals."""
-    results: list[Result] = []
     tables = [read_table(file) for file in files]
-    for collected in tables:
-        cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
-        check_seeds(cell for cell, _ in cells)
-        results += [r for r in summarise(collected.rows, cells, collected.configs).results.values() if r.runs]
+    cells = [line for table in tables for line in table.standing if line[1].state == "done"]
+    check_seeds(cell for cell, _ in cells)
+    rows, configs = (itertools.chain(*parts) for parts in ([t.rows for t in tables], [t.configs for t in tables]))
+    results = [result for result in summarise(rows, cells, configs).results.values() if result.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
     every = [used for collected in tables for *_, own in trained_with(collected) for used in own]
@@ -132,10 +138,15 @@ def arm(condition: Condition) -> str:
 
 
 def base_of(result: Result) -> str:
-    """Return the arm that an arm is compared with: any-age with its batches, for those BPQL; none for BPQL and SAC."""
+    """Return the arm that an arm is compared with: any-age with its batches, for those BPQL; none for BPQL and SAC.
+
+    That of BPQL with CrossQ's critics is BPQL with layer norm and as large batches.
+    """
     agent, own = result.condition.agent, name(result)
-    if agent == "sac" or own == BASE:
+    if agent in ("sac", "crossq:DELAY_FREE") or own == BASE:
         return ""
+    if agent == "crossq:BPQL":
+        return HALF
     if agent == "bpql" or own == WHOLE:
         return BASE
     size = result.condition.overrides.get("batch_size")
@@ -208,18 +219,18 @@ def draw(arms: list[Result], out: Path) -> None:
     figure, panels = pyplot.subplots(
         rows, columns, figsize=(11, 1.9 * rows), sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
-    for axes, result in itertools.zip_longest(panels.flat, late):
+    for number, (axes, result) in enumerate(itertools.zip_longest(panels.flat, late)):
         if result is None:
             axes.set_axis_off()
             continue
         for other, dashes in ((SAC, ":"), (base_of(result), "--")):
             if other in known:
                 axes.plot(known[other].curves.steps, known[other].curves.mean, dashes, color="#444444", linewidth=1.2)
-        colour = STYLES["bpql" if result.condition.agent == "bpql" else "any-age"][0]
+        colour = STYLES["bpql" if result.condition.agent in ("bpql", "crossq:BPQL") else "any-age"][0]
         curve(axes, *result.curves, colour)
         axes.set(xlabel="", ylabel="", xticks=[0, 50_000, 100_000])
         axes.set_title(textwrap.fill(name(result).replace("`", ""), 30, break_long_words=False), fontsize=8)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(labelsize=8, labelbottom=number >= len(late) - columns)  # the last of its column
         axes.xaxis.set_major_formatter(lambda step, _: f"{step / 1000:.0f}")
     figure.supxlabel("thousands of environment steps", fontsize=9)
     figure.supylabel("return", fontsize=9)

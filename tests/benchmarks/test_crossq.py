@@ -1,5 +1,6 @@
 """The ladder's arm with CrossQ's critics: against batch norm written out, and trained by its name."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import crossq
@@ -11,6 +12,8 @@ import pytest
 
 import delayrl
 from conftest import record, replay_of, sample
+from delayrl.agents.registry import AGENTS, Registration
+from delayrl.agents.sac import SAC
 from delayrl.core import networks
 from delayrl.core.types import Spec, Window
 
@@ -114,12 +117,26 @@ def test_actor_climbs_the_folded_critic(windows: Window) -> None:
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
+def sac_of(registration: Registration, preset: str) -> SAC:
+    """The SAC that an agent is, or has inside."""
+    agent = registration.presets[preset].agent
+    return agent if isinstance(agent, SAC) else agent.bpql
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"), [("any-age", crossq.ANY_AGE), ("bpql", crossq.BPQL), ("sac", crossq.DELAY_FREE)]
+)
+@pytest.mark.parametrize("preset", ["small", "matched", "paper"])
+def test_only_the_critics_differ(name: str, ours: Registration, preset: str) -> None:
+    plain, agent = sac_of(AGENTS[name], preset), sac_of(ours, preset)
+    differing = {field.name for field in fields(SAC) if getattr(plain, field.name) != getattr(agent, field.name)}
+    assert isinstance(agent, crossq.CrossQ)
+    assert differing - {"critic_norm"} == {"target_rate"}
+    assert ours.presets[preset].schedule == AGENTS[name].presets[preset].schedule
+
+
 @pytest.mark.thorough
-def test_it_trains_as_any_age_with_other_critics(tmp_path: Path) -> None:
-    plain = delayrl.agents.registry.AGENTS["any-age"].presets["matched"].agent
-    agent = crossq.ANY_AGE.presets["matched"].agent
-    differing = {f: (getattr(plain.bpql, f), getattr(agent.bpql, f)) for f in plain.bpql.__dataclass_fields__}
-    assert {name for name, (a, b) in differing.items() if a != b} == {"critic_norm", "target_rate"}
+def test_it_trains_by_its_name(tmp_path: Path) -> None:
     run = delayrl.train(
         "crossq:ANY_AGE", "Reacher-v5", 3, preset="small", hidden=[8, 8], batch_size=8, steps=120, random_steps=100,
         evaluate_every=120, evaluation_episodes=1, progress=False, out=tmp_path / "run",

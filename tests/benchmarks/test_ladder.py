@@ -47,6 +47,8 @@ def test_the_ladder_compares_each_arm_with_its_base() -> None:
     assert gaps == ["", "-500", "-750"]  # each from any-age that has its batches
     assert ladder.base_of(result("bpql", 25, [[0.0]], critic_norm="layer")) == "`bpql`"
     assert ladder.base_of(result("sac", 0, [[0.0]], critic_norm="layer")) == ""
+    assert ladder.base_of(result("crossq:BPQL", 25, [[0.0]], batch_size=128)) == ladder.HALF
+    assert ladder.base_of(result("crossq:DELAY_FREE", 0, [[0.0]])) == ""
 
 
 def test_update_times_are_paired_by_round(tmp_path: Path) -> None:
