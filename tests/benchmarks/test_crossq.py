@@ -131,6 +131,7 @@ def test_only_the_critics_differ(name: str, ours: Registration, preset: str) -> 
     plain, agent = sac_of(AGENTS[name], preset), sac_of(ours, preset)
     differing = {field.name for field in fields(SAC) if getattr(plain, field.name) != getattr(agent, field.name)}
     assert isinstance(agent, crossq.CrossQ)
+    assert agent.critic_norm == "none"
     assert differing - {"critic_norm"} == {"target_rate"}
     assert ours.presets[preset].schedule == AGENTS[name].presets[preset].schedule
 
