@@ -36,6 +36,7 @@ AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,480."""
 BASE, WHOLE, SAC = "`bpql`", "`any-age`", "`sac`, no delay"
 HALF = "`bpql`, `batch_size=128`, `critic_norm=layer`"
+"""BPQL with any-age's critics and half of the batch."""
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
 CROSSQ = "`crossq:ANY_AGE`, `batch_size=128`"
@@ -69,9 +70,11 @@ GOALS = [
 def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     """Draw the curves; return the tables of all arms, with what made them, and of the goals."""
     tables = [read_table(file) for file in files]
-    cells = [line for table in tables for line in table.standing if line[1].state == "done"]
+    standing = itertools.chain.from_iterable(collected.standing for collected in tables)
+    cells = [(cell, progress) for cell, progress in standing if progress.state == "done"]
     check_seeds(cell for cell, _ in cells)
-    rows, configs = (itertools.chain(*parts) for parts in ([t.rows for t in tables], [t.configs for t in tables]))
+    rows = itertools.chain.from_iterable(collected.rows for collected in tables)
+    configs = itertools.chain.from_iterable(collected.configs for collected in tables)
     results = [result for result in summarise(rows, cells, configs).results.values() if result.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)

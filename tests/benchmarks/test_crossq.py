@@ -1,4 +1,4 @@
-"""The ladder's arm with CrossQ's critics: against batch norm written out, and trained by its name."""
+"""The ladder's arms with CrossQ's critics: against batch norm written out, and trained by its name."""
 
 from dataclasses import fields
 from pathlib import Path
