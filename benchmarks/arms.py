@@ -28,9 +28,8 @@ from delayrl.play.policy import spec_of
 from delayrl.run.condition import Condition, resolve
 from delayrl.run.provenance import versions
 
-HERE = Path(__file__).parent
-OUT = HERE / "results" / "arms.jsonl"
-GRIDS = "any-age-ladder", HERE / "any-age-crossq.toml"
+OUT = Path(__file__).parent / "results" / "arms.jsonl"
+GRID = "any-age-ladder"
 ROWS, TURN = 2_000, 20  # rows of the replay, updates of a turn
 
 
@@ -59,8 +58,8 @@ def updates(condition: Condition) -> Callable[[], float]:
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Return a row for each arm, in the order of the grids."""
-    arms = {ladder.arm(cell.condition): cell.condition for grid in GRIDS for cell in load_grid(grid).cells}
+    """Return a row for each arm, in the order of the grid."""
+    arms = {ladder.arm(cell.condition): cell.condition for cell in load_grid(GRID).cells}
     turns = {}
     for name, condition in arms.items():
         if condition.agent != "random":

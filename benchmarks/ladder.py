@@ -9,6 +9,7 @@ import itertools
 import textwrap
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,10 @@ HALF = "`bpql`, `batch_size=128`, `critic_norm=layer`"
 """BPQL with any-age's critics and half of the batch."""
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
-CROSSQ = "`crossq:ANY_AGE`, `batch_size=128`"
+BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
+BPQL_BATCH, SAC_BATCH = BATCH.replace("any-age", "bpql"), "`sac`, no delay, `critic_norm=batch`"
+EARLIER = {"crossq:ANY_AGE": "any-age", "crossq:BPQL": "bpql", "crossq:DELAY_FREE": "sac"}
+"""Agents that had critics with batch norm before there was `critic_norm=batch`."""
 GOALS = [
     (WHOLE, "`bpql`, its released settings", "1.5"),
     (WHOLE, BASE, ""),
@@ -58,11 +62,16 @@ GOALS = [
     (TWICE, WHOLE, ""),
     (TWICE, "`sac`, no delay, `critic_norm=layer`", ""),
     (TWICE, "`sac`, no delay", ""),
-    (CROSSQ, "`any-age`, `batch_size=128`", ""),
-    (CROSSQ, HALF, ""),
-    (CROSSQ, "`crossq:BPQL`, `batch_size=128`", "1.15"),
-    (CROSSQ, "`sac`, no delay, `critic_norm=layer`", ""),
-    (CROSSQ, "`crossq:DELAY_FREE`, no delay", "0.75"),
+    (BATCH, "`bpql`, its released settings", "1.5"),
+    (BATCH, "`any-age`, `batch_size=128`", ""),
+    (BATCH, HALF, ""),
+    (BATCH, BPQL_BATCH, "1.15"),
+    (BATCH, "`sac`, no delay, `critic_norm=layer`", ""),
+    (BATCH, SAC_BATCH, "0.75"),
+    (BPQL_BATCH, "`bpql`, its released settings", ""),
+    (BPQL_BATCH, HALF, ""),
+    (BPQL_BATCH, "`sac`, no delay, `critic_norm=layer`", ""),
+    (BPQL_BATCH, SAC_BATCH, ""),
 ]
 """Two arms, and the ratio of their returns that is aimed at."""
 
@@ -75,7 +84,8 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     check_seeds(cell for cell, _ in cells)
     rows = itertools.chain.from_iterable(collected.rows for collected in tables)
     configs = itertools.chain.from_iterable(collected.configs for collected in tables)
-    results = [result for result in summarise(rows, cells, configs).results.values() if result.runs]
+    found = summarise(rows, cells, configs).results.values()
+    results = [replace(result, condition=as_option(result.condition)) for result in found if result.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
     every = [used for collected in tables for *_, own in trained_with(collected) for used in own]
@@ -84,6 +94,13 @@ def sections(files: list[Path], picture: Path) -> tuple[str, str]:
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
     slower = update_times(files[0].parent / "arms.jsonl")
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
+
+
+def as_option(condition: Condition) -> Condition:
+    """Return the condition with batch norm as an option, where an agent of its own had it."""
+    if condition.agent not in EARLIER:
+        return condition
+    return replace(condition, agent=EARLIER[condition.agent], overrides={**condition.overrides, "critic_norm": "batch"})
 
 
 def check_seeds(cells: Iterable[Cell]) -> None:
@@ -143,12 +160,12 @@ def arm(condition: Condition) -> str:
 def base_of(result: Result) -> str:
     """Return the arm that an arm is compared with: any-age with its batches, for those BPQL; none for BPQL and SAC.
 
-    That of BPQL with CrossQ's critics is BPQL with layer norm and as large batches.
+    That of BPQL with batch norm is BPQL with layer norm and as large batches.
     """
     agent, own = result.condition.agent, name(result)
-    if agent in ("sac", "crossq:DELAY_FREE") or own == BASE:
+    if agent == "sac" or own == BASE:
         return ""
-    if agent == "crossq:BPQL":
+    if own == BPQL_BATCH:
         return HALF
     if agent == "bpql" or own == WHOLE:
         return BASE
@@ -229,7 +246,7 @@ def draw(arms: list[Result], out: Path) -> None:
         for other, dashes in ((SAC, ":"), (base_of(result), "--")):
             if other in known:
                 axes.plot(known[other].curves.steps, known[other].curves.mean, dashes, color="#444444", linewidth=1.2)
-        colour = STYLES["bpql" if result.condition.agent in ("bpql", "crossq:BPQL") else "any-age"][0]
+        colour = STYLES["bpql" if result.condition.agent == "bpql" else "any-age"][0]
         curve(axes, *result.curves, colour)
         axes.set(xlabel="", ylabel="", xticks=[0, 50_000, 100_000])
         axes.set_title(textwrap.fill(name(result).replace("`", ""), 30, break_long_words=False), fontsize=8)

@@ -47,8 +47,11 @@ def test_the_ladder_compares_each_arm_with_its_base() -> None:
     assert gaps == ["", "-500", "-750"]  # each from any-age that has its batches
     assert ladder.base_of(result("bpql", 25, [[0.0]], critic_norm="layer")) == "`bpql`"
     assert ladder.base_of(result("sac", 0, [[0.0]], critic_norm="layer")) == ""
-    assert ladder.base_of(result("crossq:BPQL", 25, [[0.0]], batch_size=128)) == ladder.HALF
-    assert ladder.base_of(result("crossq:DELAY_FREE", 0, [[0.0]])) == ""
+    assert ladder.base_of(result("bpql", 25, [[0.0]], batch_size=128, critic_norm="batch")) == ladder.HALF
+    whole = result("any-age", 25, [[0.0]], batch_size=128, critic_norm="batch")
+    assert ladder.base_of(whole) == "`any-age`, `batch_size=128`"
+    earlier = result("crossq:ANY_AGE", 25, [[0.0]], batch_size=128)
+    assert ladder.as_option(earlier.condition) == whole.condition
 
 
 def test_update_times_are_paired_by_round(tmp_path: Path) -> None:

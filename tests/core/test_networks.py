@@ -13,6 +13,7 @@ from jax.extend.random import threefry_2x32
 from scipy import stats
 from scipy.special import erf
 
+from delayrl.agents.critics import lower_q
 from delayrl.core import networks
 from delayrl.core.networks import linear
 from delayrl.core.transformer import dropout, dropout_masks, threefry, transformer, transformer_init
@@ -145,7 +146,7 @@ def test_critics_by_hand() -> None:
     s, one, other = jnp.ones(1), jnp.ones(1), -jnp.ones(1)
     np.testing.assert_allclose(networks.twin(critic, s, one), [30.0, -18.0])
     np.testing.assert_allclose(networks.twin(critic, s, other), [-9.0, 22.0])
-    assert networks.lower_q(critic, s, one, other) == networks.lower_q(critic, s, other, one) == 1.0
+    assert lower_q(critic, s, one, other) == lower_q(critic, s, other, one) == 1.0
     twins = networks.twin_init(jax.random.key(0), (3, 1))
     assert not np.array_equal(twins[0][0]["w"], twins[1][0]["w"])
 

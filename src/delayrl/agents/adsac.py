@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase
+from delayrl.agents.critics import lower_q
 from delayrl.core import networks
 from delayrl.core.networks import Params
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
@@ -88,6 +89,10 @@ class ADSAC:
                 f"temperature_every must be at most actor_updates, {self.learner.actor_updates}, or no temperature is "
                 f"ever updated; got {self.temperature_every}"
             )
+        if self.learner.critic_norm == "batch":
+            raise DelayRLError(
+                "ad-sac's critics have target critics, which critic_norm=batch has not; give none or layer"
+            )
         auxiliary_key, augmented_key = jax.random.split(key)
         auxiliary = self.learner.init(replace(spec, delay=self.auxiliary_delay), auxiliary_key)
         own = self.learner.init(spec, augmented_key)
@@ -105,7 +110,7 @@ class ADSAC:
         truth = seen.truth
         assert truth is not None, "behaviour with the auxiliary actor is privileged"
         auxiliary, _ = networks.sample(self.learner.policy(state.auxiliary.actor, truth), auxiliary_key)
-        return networks.lower_q(state.auxiliary.critic, truth, auxiliary, augmented)
+        return lower_q(state.auxiliary.critic, truth, auxiliary, augmented)
 
     def deterministic(self, state: State) -> Deterministic:
         """Return the augmented actor. Its action is the mode, even if `evaluation` samples."""

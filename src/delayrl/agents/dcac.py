@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from delayrl.agents.base import Deterministic, Phase, descend
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian, Params
-from delayrl.core.objectives import k_step_return, soft_target, temperature_loss
+from delayrl.core.objectives import k_step_return, soft_target, squared_errors, temperature_loss
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import input_size, look, network_input
 from delayrl.errors import DelayRLError
@@ -147,7 +147,7 @@ class DCAC:
         rolls = self.roll(actor, windows, key)
         y = self.soft_return(rolls, self.reward_scale, temperature, values(target, rolls.x_last))
         value = values(critic, jax.lax.stop_gradient(rolls.x))
-        critic_loss = ((value - jax.lax.stop_gradient(y)) ** 2).mean(-1).sum()
+        critic_loss = squared_errors(value, y)
         # without the rewards of a stretch, which do not depend on its new actions
         frozen = jax.lax.stop_gradient(critic)
         actor_loss = -self.soft_return(rolls, 0.0, temperature, values(frozen, rolls.x_last)).mean()

@@ -24,16 +24,17 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from delayrl.agents.base import Deterministic, Phase, descend
+from delayrl.agents.critics import CriticNorm, critics_init, learn_in_one_pass, plain
 from delayrl.core import networks
-from delayrl.core.networks import Gaussian, LogStdBounds, Norm, Params
-from delayrl.core.objectives import k_step_return, soft_target, soft_value, temperature_loss
+from delayrl.core.networks import Gaussian, LogStdBounds, Params
+from delayrl.core.objectives import k_step_target, soft_value, squared_errors, temperature_loss
 from delayrl.core.types import Action, Key, Metrics, Seen, Spec, Window
 from delayrl.core.views import Sees, input_size, look, network_input
 from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Actor, critics, target critics, log-temperature and optimiser states."""
+    """Actor, critics, target critics (with batch norm its running moments), log-temperature and optimiser states."""
 
     actor: Params
     critic: Params
@@ -63,7 +64,7 @@ class SAC:
     actor_sees: Annotated[Sees, "fixed"] = "current"
     critic_sees: Annotated[Sees, "fixed"] = "current"
     hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
-    critic_norm: Annotated[Norm, "norm of the critics' hidden layers, before their ReLU"] = "none"
+    critic_norm: Annotated[CriticNorm, "norm in the critics: layer, before each ReLU, or batch, before all"] = "none"
     actor_learning_rate: Annotated[float, "Adam's step size for the actor", (0.0, 1.0)] = 3e-4
     critic_learning_rate: Annotated[float, "Adam's step size for the critics", (0.0, 1.0)] = 1e-3
     temperature_learning_rate: Annotated[float, "Adam's step size for the temperature", (0.0, 1.0)] = 1e-3
@@ -71,7 +72,7 @@ class SAC:
     entropy_per_action: Annotated[float, "target entropy per action dimension"] = -1.0
     entropy_unit: Annotated[EntropyUnit, "unit of actions for entropies: scaled to [-1, 1], or the task's"] = "task"
     discount: Annotated[float, "γ", (0.0, 1.0)] = 0.99
-    target_rate: Annotated[float, "τ: rate at which the target critics follow the critics", (0.0, 1.0)] = 5e-3
+    target_rate: Annotated[float, "τ: rate at which target critics, if any, follow the critics", (0.0, 1.0)] = 5e-3
     n_steps: Annotated[int, "longest k of the k-step targets; k is drawn from 1..n_steps"] = 3
     actor_every: Annotated[int, "critic updates between rounds of actor updates"] = 2
     actor_updates: Annotated[int, "actor updates per round"] = 2
@@ -93,7 +94,7 @@ class SAC:
         return (Phase(self.update_every, self.updates, self.batch_size, self.update),)
 
     def init(self, spec: Spec, key: Key) -> State:
-        """Initialise the networks. The target critics start as copies."""
+        """Initialise the networks. The target critics start as copies; critics with batch norm have none."""
         if self.actor_sees == "current" and spec.delay > 0:
             raise DelayRLError(
                 f"sac is the delay-free reference: train it with --delay 0, got {spec.delay}; "
@@ -103,12 +104,12 @@ class SAC:
         sizes = (input_size(spec, self.actor_sees), *self.hidden, 2 * spec.action_size)
         actor = networks.mlp_init(actor_key, sizes)
         sizes = (input_size(spec, self.critic_sees) + spec.action_size, *self.hidden, 1)
-        critic = networks.twin_init(critic_key, sizes, self.critic_norm)
+        critic, target = critics_init(critic_key, sizes, self.critic_norm)
         log_temperature = jnp.log(jnp.asarray(self.initial_temperature, jnp.float32))
         return State(
             actor,
             critic,
-            jax.tree.map(jnp.copy, critic),
+            target,
             log_temperature,
             optax.adam(self.actor_learning_rate).init(actor),
             optax.adam(self.critic_learning_rate).init(critic),
@@ -143,8 +144,12 @@ class SAC:
         temperature = jnp.exp(state.log_temperature)
         action, log_prob = networks.sample(self.policy(state.actor, actor_next), target_key)
         log_prob -= self.log_scale(windows)
-        next_value = soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature)
-        state, metrics = self.learn_critic(state, windows, critic_now, next_value)
+        if self.critic_norm == "batch":
+            later, rates = jnp.concatenate([critic_next, action], -1), (self.critic_learning_rate, self.discount)
+            state, metrics = learn_in_one_pass(state, windows, critic_now, later, log_prob, *rates)
+        else:
+            next_value = soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature)
+            state, metrics = self.learn_critic(state, windows, critic_now, next_value)
 
         def improve(state: State) -> State:
             for update_key in jax.random.split(actor_key, self.actor_updates):
@@ -160,29 +165,27 @@ class SAC:
         self, state: State, windows: Window, critic_input: Array, next_value: Float[Array, " batch"]
     ) -> tuple[State, Metrics]:
         """Update both critics towards the soft k-step target, given V(s_{t+k}), then the target critics."""
-        now, last = windows.delay, windows.delay + windows.n_step - 1
-        y = soft_target(
-            k_step_return(windows.reward[:, now:], self.discount, windows.n_step),
-            self.discount**windows.n_step,
-            jnp.take_along_axis(windows.terminated, last[:, None], 1)[:, 0],
-            next_value,
-        )
-        adam, batch = optax.adam(self.critic_learning_rate), (critic_input, windows.action[:, now], y)
-        critic, opt_state, loss, q = descend(adam, critic_loss, state.critic, state.critic_opt_state, *batch)
+        y = k_step_target(windows, self.discount, next_value)
+
+        def loss(critic: Params) -> tuple[Array, Array]:
+            q = networks.twin(critic, critic_input, windows.action[:, windows.delay])
+            return squared_errors(q, y), q.mean()
+
+        adam = optax.adam(self.critic_learning_rate)
+        critic, opt_state, value, q = descend(adam, loss, state.critic, state.critic_opt_state)
         target = optax.incremental_update(critic, state.target, self.target_rate)
-        state = state._replace(critic=critic, critic_opt_state=opt_state, target=target)
-        return state, {"critic_loss": loss, "q": q}
+        return state._replace(critic=critic, critic_opt_state=opt_state, target=target), {"critic_loss": value, "q": q}
 
     def improve_actor(
         self, state: State, actor_input: Array, critic_input: Array, key: Key, penalty: Penalty = no_penalty
     ) -> State:
         """Take one gradient step on the actor towards higher soft values (VDPO eq. 9)."""
-        temperature = jnp.exp(state.log_temperature)
+        temperature, critic = jnp.exp(state.log_temperature), plain(state.critic, state.target)
 
         def loss(actor: Params) -> tuple[Array, None]:
             policy = self.policy(actor, actor_input)
             action, log_prob = networks.sample(policy, key)
-            value = soft_value(networks.twin(state.critic, critic_input, action), log_prob, temperature)
+            value = soft_value(networks.twin(critic, critic_input, action), log_prob, temperature)
             return penalty(actor, policy) - value.mean(), None
 
         adam = optax.adam(self.actor_learning_rate)
@@ -213,12 +216,6 @@ class SAC:
         ahead = jnp.broadcast_to(ahead, windows.n_step.shape)
         pair = jax.vmap(lambda window, k: (look(window, self.actor_sees, k), look(window, self.critic_sees, k)))
         return pair(windows, ahead)
-
-
-def critic_loss(critic: Params, x: Array, action: Array, target: Array) -> tuple[Array, Array]:
-    """Return the sum of both critics' squared errors (VDPO eq. 8), and their mean Q-value."""
-    q = networks.twin(critic, x, action)
-    return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum(), q.mean()
 
 
 BPQL = SAC(

@@ -151,11 +151,3 @@ def twin(
     """Return both critics' Q-values. Two small products are faster on a CPU than one batched product."""
     both = jnp.concatenate([x, action], -1)
     return jnp.stack([mlp(critic, both)[..., 0] for critic in params])
-
-
-def lower_q(
-    critic: Params, x: Float[Array, " input"], one: Float[Array, " action"], other: Float[Array, " action"]
-) -> Float[Array, " action"]:
-    """Return the action with the lower min_i Q_i: the behaviour in the released code of VDPO and AD-SAC."""
-    q_one, q_other = (twin(critic, x, action).min(0) for action in (one, other))
-    return jnp.where(q_one < q_other, one, other)

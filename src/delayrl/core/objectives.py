@@ -1,9 +1,11 @@
 """Losses and targets on plain arrays, each with its equation."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from delayrl.core.networks import Gaussian
+from delayrl.core.types import Window
 
 
 def k_step_return(
@@ -22,6 +24,22 @@ def soft_target(
 ) -> Float[Array, "*batch"]:
     """Return Y = R + γ^k (1 - terminated) V(s_{t+k}) (VDPO eq. 8, for k steps). A time limit is not a termination."""
     return reward + discount * jnp.where(terminated, 0, next_value)
+
+
+def k_step_target(windows: Window, discount: float, next_value: Float[Array, " batch"]) -> Float[Array, " batch"]:
+    """Return the soft target of step t of each window, for its own k, given V(s_{t+k})."""
+    last = windows.delay + windows.n_step - 1
+    return soft_target(
+        k_step_return(windows.reward[:, windows.delay :], discount, windows.n_step),
+        discount**windows.n_step,
+        jnp.take_along_axis(windows.terminated, last[:, None], 1)[:, 0],
+        next_value,
+    )
+
+
+def squared_errors(q: Float[Array, "2 *batch"], target: Float[Array, "*batch"]) -> Float[Array, ""]:
+    """Return the sum of both critics' mean squared errors (VDPO eq. 8). No gradient goes through the target."""
+    return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum()
 
 
 def soft_value(
