@@ -27,6 +27,8 @@ VARIANTS = (
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
     "`any-age`, `batch_size=128`",
     "`any-age`, `batch_size=128`, `encoder=mlp`",
+    "`any-age`, `batch_size=128`, `critic_norm=batch`",
+    "`bpql`, `batch_size=128`, `critic_norm=batch`",
 )
 """Shown beside the arms of the first page."""
 SIMPLER = (
@@ -37,6 +39,8 @@ SIMPLER = (
     "`any-age`, `batch_size=128`, `encoder=mlp`",
     "`bpql`, `critic_norm=layer`",
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
+    "`any-age`, `batch_size=128`, `critic_norm=batch`",
+    "`bpql`, `batch_size=128`, `critic_norm=batch`",
     "`bpql`",
 )
 WHERE: dict[str, tuple[str, int | str]] = {

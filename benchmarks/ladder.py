@@ -63,6 +63,7 @@ GOALS = [
     (TWICE, "`sac`, no delay, `critic_norm=layer`", ""),
     (TWICE, "`sac`, no delay", ""),
     (BATCH, "`bpql`, its released settings", "1.5"),
+    (BATCH, WHOLE, ""),
     (BATCH, "`any-age`, `batch_size=128`", ""),
     (BATCH, HALF, ""),
     (BATCH, BPQL_BATCH, "1.15"),
