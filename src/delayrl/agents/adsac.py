@@ -91,7 +91,7 @@ class ADSAC:
             )
         if self.learner.critic_norm == "batch":
             raise DelayRLError(
-                "ad-sac's critics have target critics, which critic_norm=batch has not; give none or layer"
+                "ad-sac learns from target critics, and with critic_norm=batch there are none; give none or layer"
             )
         auxiliary_key, augmented_key = jax.random.split(key)
         auxiliary = self.learner.init(replace(spec, delay=self.auxiliary_delay), auxiliary_key)

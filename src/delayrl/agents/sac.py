@@ -64,7 +64,7 @@ class SAC:
     actor_sees: Annotated[Sees, "fixed"] = "current"
     critic_sees: Annotated[Sees, "fixed"] = "current"
     hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
-    critic_norm: Annotated[CriticNorm, "norm in the critics: layer, before each ReLU, or batch, before all"] = "none"
+    critic_norm: Annotated[CriticNorm, "the critics' norm: layer, before ReLUs, or batch, before layers"] = "none"
     actor_learning_rate: Annotated[float, "Adam's step size for the actor", (0.0, 1.0)] = 3e-4
     critic_learning_rate: Annotated[float, "Adam's step size for the critics", (0.0, 1.0)] = 1e-3
     temperature_learning_rate: Annotated[float, "Adam's step size for the temperature", (0.0, 1.0)] = 1e-3
