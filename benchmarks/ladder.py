@@ -105,13 +105,13 @@ def as_option(condition: Condition) -> Condition:
 
 
 def check_seeds(cells: Iterable[Cell]) -> None:
-    """Raise DelayRLError where an arm has other seeds than 0 to n - 1: seeds are paired by their place."""
-    seeds: dict[str, set[int]] = defaultdict(set)
+    """Raise DelayRLError where an arm has other seeds than 0 to n - 1, each once: seeds are paired by their place."""
+    seeds: dict[str, list[int]] = defaultdict(list)
     for cell in cells:
-        seeds[arm(cell.condition)] |= {*cell.seeds}
+        seeds[arm(as_option(cell.condition))] += cell.seeds
     for words, own in seeds.items():
-        if own != {*range(len(own))}:
-            raise DelayRLError(f"{words} has ended for seeds {sorted(own)}: run those before them")
+        if sorted(own) != [*range(len(own))]:
+            raise DelayRLError(f"{words} has ended for seeds {sorted(own)}: each from 0 on is needed, and once")
 
 
 def made_on(used: list[dict[str, Any]]) -> str:

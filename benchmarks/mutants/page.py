@@ -39,7 +39,7 @@ def text(mutants: list[Mutant], rows: dict[str, dict[str, Any]], older: set[str]
         "## By file\n\nOf some mutants the file or a test file has changed since they were tried: the last column.\n"
     )
     lines = ["| file | mutants | killed | changed since |", "| --- | --- | --- | --- |"]
-    for file, group in groupby(found, lambda mutant: mutant.file):
+    for file, group in groupby(sorted(found, key=lambda mutant: mutant.file), lambda mutant: mutant.file):
         these = list(group)
         noticed = sum(mutant not in survivors for mutant in these)
         changed = sum(mutant.name in older for mutant in these)

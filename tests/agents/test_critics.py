@@ -1,53 +1,94 @@
-"""Critics with batch norm, against batch norm written out."""
+"""Twin critics, plain and with batch norm, against batch norm written out."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from delayrl.agents.critics import critics_init, in_training, plain
-from delayrl.core import networks
+from delayrl.agents.critics import Moments, critics_init, lower_q, q_values
+from delayrl.core.networks import linear_init
+from delayrl.core.precision import setting
+
+SIZES = (5, 8, 8, 1)
 
 
-def written_out(critic: dict, x: np.ndarray) -> np.ndarray:
-    """Batch norm, linear, ReLU, batch norm, …, with NumPy."""
+def written_out(critic: dict, x: np.ndarray, moments: list | None = None) -> np.ndarray:
+    """Batch norm, linear, ReLU, batch norm, …, with NumPy in float64; by the batch's moments or by others."""
+    x = x.astype(np.float64)
     for number, (layer, norm) in enumerate(zip(critic["layers"], critic["norms"], strict=True)):
         x = np.maximum(x, 0) if number else x
-        x = (x - x.mean(0)) / np.sqrt(x.var(0) + 1e-3) * np.asarray(norm["scale"]) + np.asarray(norm["shift"])
-        x = x @ np.asarray(layer["w"]) + np.asarray(layer["b"])
+        mean, variance = map(np.asarray, moments[number]) if moments else (x.mean(0), x.var(0))
+        x = (x - mean) / np.sqrt(variance + 1e-3) * np.asarray(norm["scale"]) + np.asarray(norm["shift"])
+        x = x @ np.asarray(layer["w"], np.float64) + np.asarray(layer["b"])
     return x[:, 0]
 
 
-def drawn(seed: int) -> tuple[list, np.ndarray]:
-    """Critics with norms of any scale and shift, and a batch far from mean 0 and deviation 1."""
-    keys = iter(jax.random.split(jax.random.key(seed), 8))
-    critics, _ = critics_init(next(keys), (5, 8, 8, 1), "batch")
+def drawn(seed: int, sizes: tuple[int, ...] = SIZES) -> tuple[list, list]:
+    """Critics with norms of any scale and shift, and running moments of any mean and variance."""
+    critics, running = critics_init(jax.random.key(seed), sizes, "batch")
+    rng = np.random.default_rng(seed)
     for critic in critics:
         critic["norms"] = [
-            {"scale": 1 + jax.random.normal(key, (size,)), "shift": jax.random.normal(key, (size,))}
-            for key, size in zip(keys, (5, 8, 8), strict=False)
+            {"scale": jnp.asarray(1 + rng.normal(size=n), jnp.float32), "shift": jnp.asarray(rng.normal(size=n))}
+            for n in sizes[:-1]
         ]
-    return critics, np.asarray(3 + 2 * jax.random.normal(jax.random.key(seed + 1), (32, 5)))
+    running = [
+        [Moments(jnp.asarray(rng.normal(size=n)), jnp.asarray(rng.uniform(0.2, 3, n))) for n in sizes[:-1]]
+        for _ in running
+    ]
+    return critics, running
 
 
-def test_values_are_batch_norms() -> None:
-    critics, x = drawn(0)
-    q, moments = in_training(critics, jnp.asarray(x))
-    np.testing.assert_allclose(q, [written_out(critic, x) for critic in critics], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(moments[1][0].mean, x.mean(0), rtol=1e-5)
-    np.testing.assert_allclose(moments[1][0].variance, x.var(0), rtol=1e-4)
+def test_values_by_running_moments() -> None:
+    """Of a batch, of a batch of batches, and of one sample, each critic by its own."""
+    critics, running = drawn(0)
+    x = np.random.default_rng(1).normal(3, 2, (32, 5)).astype(np.float32)
+    expected = np.stack([written_out(critic, x, own) for critic, own in zip(critics, running, strict=True)])
+    for shape in ((32,), (4, 8)):
+        batch = jnp.asarray(x.reshape(*shape, 5))
+        q = q_values(critics, running, batch[..., :3], batch[..., 3:])
+        np.testing.assert_allclose(q, expected.reshape(2, *shape), rtol=1e-4, atol=1e-4)
+    one = q_values(critics, running, jnp.asarray(x[7, :3]), jnp.asarray(x[7, 3:]))
+    np.testing.assert_allclose(one, expected[:, 7], rtol=1e-4, atol=1e-4)
 
 
-def test_plain_critics_have_the_moments_in_their_layers() -> None:
-    """With the batch's own moments they give the batch's values; one sample's no longer hang on the others."""
-    critics, x = drawn(1)
-    q, moments = in_training(critics, jnp.asarray(x))
-    for rows in (slice(None), slice(3)):
-        values = networks.twin(plain(critics, moments), jnp.asarray(x[rows, :3]), jnp.asarray(x[rows, 3:]))
-        np.testing.assert_allclose(values, q[:, rows], rtol=1e-4, atol=1e-4)
+def test_nearly_constant_inputs_in_bfloat16() -> None:
+    """An input that varies by a thousandth of its mean is centred before it is rounded to eight bits."""
+    critics, running = drawn(2, (5, 64, 64, 1))
+    x = np.random.default_rng(3).normal(size=(64, 5)).astype(np.float32)
+    x[:, 0] = 100 + 0.1 * x[:, 0]
+    for own in running:
+        own[0] = Moments(own[0].mean.at[0].set(100), own[0].variance.at[0].set(0.01))
+    expected = np.stack([written_out(critic, x, own) for critic, own in zip(critics, running, strict=True)])
+    with jax.default_matmul_precision(setting("bfloat16")):
+        q = q_values(critics, running, jnp.asarray(x[:, :3]), jnp.asarray(x[:, 3:]))
+    assert np.abs(q - expected).max() < 0.05 * expected.std()
 
 
-def test_other_critics_start_as_their_targets() -> None:
+def test_plain_critics_start_as_their_targets() -> None:
     for norm in ("none", "layer"):
-        critics, target = critics_init(jax.random.key(0), (5, 8, 1), norm)
-        assert jax.tree.map(lambda x, y: bool((x == y).all()), critics, target) == jax.tree.map(lambda x: True, critics)
-        assert plain(critics, target) == critics
+        critics, target = critics_init(jax.random.key(0), SIZES, norm)
+        for one, other in zip(jax.tree.leaves(critics), jax.tree.leaves(target), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_lower_q_by_hand() -> None:
+    """(30, -18) at (s, a) = (1, 1) and (-9, 22) at (1, -1): the first has the lower minimum."""
+    critic = [[{"w": jnp.array([[s], [a]]), "b": jnp.zeros(1)}] for s, a in ((10.5, 19.5), (2.0, -20.0))]
+    s, one, other = jnp.ones(1), jnp.ones(1), -jnp.ones(1)
+    np.testing.assert_allclose(q_values(critic, [], s, one), [30.0, -18.0])
+    np.testing.assert_allclose(q_values(critic, [], s, other), [-9.0, 22.0])
+    assert lower_q(critic, [], s, one, other) == lower_q(critic, [], s, other, one) == 1.0
+
+
+def test_lower_q_by_running_moments() -> None:
+    """Q(s, a) = ±(a - mean) for both critics: which of two actions is lower hangs on their running moments."""
+    layer = linear_init(jax.random.key(0), 2, 1) | {"w": jnp.array([[0.0], [1.0]]), "b": jnp.zeros(1)}
+    norm = {"scale": jnp.ones(2), "shift": jnp.zeros(2)}
+    critics = [
+        {"layers": [layer], "norms": [norm]},
+        {"layers": [layer | {"w": -layer["w"]}], "norms": [norm]},
+    ]
+    one, other = jnp.ones(1), -jnp.ones(1)
+    for mean, lower in ((0.5, other), (-0.5, one)):  # |a - mean| is larger for it, and one critic has its negative
+        running = [[Moments(jnp.array([0.0, mean]), jnp.ones(2))]] * 2
+        assert lower_q(critics, running, jnp.ones(1), one, other) == lower

@@ -23,6 +23,12 @@ def test_the_ladder_pairs_seeds_by_place() -> None:
     ladder.check_seeds(cells[:2])
     with pytest.raises(delayrl.DelayRLError, match=r"`bpql` has ended for seeds \[0, 1, 3\]"):
         ladder.check_seeds([cells[0], cells[2]])
+    options = {"batch_size": 128, "critic_norm": "batch"}
+    earlier = Cell(Condition("crossq:BPQL", "X-v0", 25, preset="matched", overrides={"batch_size": 128}), (0,), "old")
+    ladder.check_seeds([earlier])
+    later = Cell(Condition("bpql", "X-v0", 25, preset="matched", overrides=options), (0,), "new")
+    with pytest.raises(delayrl.DelayRLError, match=r"seeds \[0, 0\]"):
+        ladder.check_seeds([earlier, later])
 
 
 def test_the_ladder_compares_each_arm_with_its_base() -> None:

@@ -110,7 +110,7 @@ class ADSAC:
         truth = seen.truth
         assert truth is not None, "behaviour with the auxiliary actor is privileged"
         auxiliary, _ = networks.sample(self.learner.policy(state.auxiliary.actor, truth), auxiliary_key)
-        return lower_q(state.auxiliary.critic, truth, auxiliary, augmented)
+        return lower_q(state.auxiliary.critic, state.auxiliary.target, truth, auxiliary, augmented)
 
     def deterministic(self, state: State) -> Deterministic:
         """Return the augmented actor. Its action is the mode, even if `evaluation` samples."""

@@ -1,7 +1,7 @@
-"""Twin critics of SAC: with target critics, or with batch norm and none (CrossQ: Bhatt et al., ICLR 2024).
+"""SAC's twin critics: with target critics, or with batch norm and none (CrossQ: Bhatt et al., ICLR 2024).
 
-Batch norm stands before every layer. Where critics learn, they are normalised by the batch's own moments. Where only
-values are wanted, it is by running moments: these are fixed, so a norm is a part of the layer after it.
+Batch norm stands before every layer. Where critics learn, the moments of the batch normalise it; where only values are
+wanted, running moments do, which follow those of batches.
 """
 
 from typing import Literal, NamedTuple
@@ -18,8 +18,10 @@ from delayrl.core.objectives import k_step_target, soft_value, squared_errors
 from delayrl.core.types import Key, Metrics, Window
 
 CriticNorm = Literal["none", "layer", "batch"]
-EPSILON, MOMENTUM = 1e-3, 0.99
-"""Added to the variance; rate at which running moments stay as they are. CrossQ's."""
+EPSILON = 1e-3
+"""What is added to a variance (CrossQ's)."""
+MOMENTUM = 0.99
+"""What running moments keep of themselves at each update (CrossQ's)."""
 
 
 class Moments(NamedTuple):
@@ -30,7 +32,7 @@ class Moments(NamedTuple):
 
 
 def critics_init(key: Key, sizes: tuple[int, ...], norm: CriticNorm) -> tuple[Params, Params]:
-    """Initialise two critics and their target critics, copies; or for batch norm their running moments."""
+    """Initialise two critics, and their target critics as copies or, with batch norm, their running moments."""
     if norm != "batch":
         critics = networks.twin_init(key, sizes, norm)
         return critics, jax.tree.map(jnp.copy, critics)
@@ -44,67 +46,66 @@ def critics_init(key: Key, sizes: tuple[int, ...], norm: CriticNorm) -> tuple[Pa
 def learn_in_one_pass(
     state: State,
     windows: Window,
-    critic_input: Float[Array, "batch input"],
-    later: Float[Array, "batch inputs"],
+    critic_now: Float[Array, "batch input"],
+    critic_next: Float[Array, "batch input"],
+    next_action: Float[Array, "batch action"],
     log_prob: Float[Array, " batch"],
+    *,
     learning_rate: float,
     discount: float,
 ) -> tuple[State, Metrics]:
-    """Update a SAC's critics that have batch norm, then their running moments.
+    """Update the critics of a SAC that have batch norm, then their running moments.
 
-    One pass over (s_t, a_t) and `later`, (s_{t+k}, a'), gives values and targets, both normalised by the moments of
-    their mixture. So there are no target critics.
+    One pass over (s_t, a_t) and (s_{t+k}, a') gives values and targets, both normalised by the moments of their
+    mixture. So there are no target critics.
     """
-    pairs = jnp.concatenate([jnp.concatenate([critic_input, windows.action[:, windows.delay]], -1), later])
+    actions = jnp.concatenate([windows.action[:, windows.delay], next_action])
+    pairs = jnp.concatenate([jnp.concatenate([critic_now, critic_next]), actions], -1)
     temperature = jnp.exp(state.log_temperature)
 
     def loss(critics: Params) -> tuple[Array, tuple[Array, Params]]:
-        values, moments = in_training(critics, pairs)
-        q, next_q = jnp.split(values, 2, -1)
+        values, moments = zip(*(_pass(critic, pairs) for critic in critics), strict=True)
+        q, next_q = jnp.split(jnp.stack(values), 2, -1)
         y = k_step_target(windows, discount, soft_value(next_q, log_prob, temperature))
-        return squared_errors(q, y), (q.mean(), moments)
+        return squared_errors(q, y), (q.mean(), list(moments))
 
-    critic, opt_state, value, (q, moments) = descend(
-        optax.adam(learning_rate), loss, state.critic, state.critic_opt_state
-    )
+    adam = optax.adam(learning_rate)
+    critic, opt_state, value, (q, moments) = descend(adam, loss, state.critic, state.critic_opt_state)
     running = optax.incremental_update(moments, state.target, 1 - MOMENTUM)
     return state._replace(critic=critic, critic_opt_state=opt_state, target=running), {"critic_loss": value, "q": q}
 
 
-def in_training(critics: Params, x: Float[Array, "batch inputs"]) -> tuple[Float[Array, "2 batch"], Params]:
-    """Return both critics' values of a batch that is normalised by its own moments, and these."""
-    values, moments = zip(*(_in_training(critic, x) for critic in critics), strict=True)
-    return jnp.stack(values), list(moments)
+def q_values(
+    critics: Params, running: Params, x: Float[Array, "*batch inputs"], action: Float[Array, "*batch action"]
+) -> Float[Array, "2 *batch"]:
+    """Return both critics' values. Only critics with batch norm read their running moments."""
+    if not isinstance(critics[0], dict):
+        return networks.twin(critics, x, action)
+    pairs = jnp.concatenate([x, action], -1)
+    return jnp.stack([_pass(critic, pairs, own)[0] for critic, own in zip(critics, running, strict=True)])
 
 
-def _in_training(critic: Params, x: Float[Array, "batch inputs"]) -> tuple[Float[Array, " batch"], list[Moments]]:
-    moments = []
+def _pass(
+    critic: Params, x: Float[Array, "*batch inputs"], running: list[Moments] | None = None
+) -> tuple[Float[Array, "*batch"], list[Moments]]:
+    """Return a critic's values, normalised by running moments or else by the batch's own, and the moments."""
+    used = []
     for number, (layer, norm) in enumerate(zip(critic["layers"], critic["norms"], strict=True)):
         x = jax.nn.relu(x) if number else x
-        moments.append(Moments(x.mean(0), x.var(0)))
-        normal = (x - moments[-1].mean) * jax.lax.rsqrt(moments[-1].variance + EPSILON)
+        moments = running[number] if running else Moments(x.mean(0), x.var(0))
+        normal = (x - moments.mean) * jax.lax.rsqrt(moments.variance + EPSILON)
         x = networks.linear(layer, normal * norm["scale"] + norm["shift"])
-    return x[:, 0], moments
-
-
-def plain(critics: Params, target: Params) -> Params:
-    """Return critics that `networks.twin` takes: those with batch norm have the running moments in their layers."""
-    pairs = zip(critics, target, strict=True)
-    return [_folded(*pair) if isinstance(pair[0], dict) else pair[0] for pair in pairs]
-
-
-def _folded(critic: Params, running: list[Moments]) -> Params:
-    layers = []
-    for layer, norm, moments in zip(critic["layers"], critic["norms"], running, strict=True):
-        scale = norm["scale"] * jax.lax.rsqrt(moments.variance + EPSILON)
-        shift = norm["shift"] - moments.mean * scale
-        layers.append({"w": scale[:, None] * layer["w"], "b": layer["b"] + shift @ layer["w"]})
-    return layers
+        used.append(moments)
+    return x[..., 0], used
 
 
 def lower_q(
-    critics: Params, x: Float[Array, " input"], one: Float[Array, " action"], other: Float[Array, " action"]
+    critics: Params,
+    running: Params,
+    x: Float[Array, " input"],
+    one: Float[Array, " action"],
+    other: Float[Array, " action"],
 ) -> Float[Array, " action"]:
     """Return the action with the lower min_i Q_i: the behaviour in the released code of VDPO and AD-SAC."""
-    q_one, q_other = (networks.twin(critics, x, action).min(0) for action in (one, other))
+    q_one, q_other = (q_values(critics, running, x, action).min(0) for action in (one, other))
     return jnp.where(q_one < q_other, one, other)

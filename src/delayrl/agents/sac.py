@@ -24,7 +24,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from delayrl.agents.base import Deterministic, Phase, descend
-from delayrl.agents.critics import CriticNorm, critics_init, learn_in_one_pass, plain
+from delayrl.agents.critics import CriticNorm, critics_init, learn_in_one_pass, q_values
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian, LogStdBounds, Params
 from delayrl.core.objectives import k_step_target, soft_value, squared_errors, temperature_loss
@@ -34,7 +34,7 @@ from delayrl.errors import DelayRLError
 
 
 class State(NamedTuple):
-    """Actor, critics, target critics (with batch norm its running moments), log-temperature and optimiser states."""
+    """Actor, critics, target critics or, with batch norm, running moments, log-temperature, optimiser states."""
 
     actor: Params
     critic: Params
@@ -64,7 +64,7 @@ class SAC:
     actor_sees: Annotated[Sees, "fixed"] = "current"
     critic_sees: Annotated[Sees, "fixed"] = "current"
     hidden: Annotated[tuple[int, ...], "widths of the hidden layers of actor and critics"] = (256, 256)
-    critic_norm: Annotated[CriticNorm, "the critics' norm: layer, before ReLUs, or batch, before layers"] = "none"
+    critic_norm: Annotated[CriticNorm, "norm in the critics: layer, or batch without target critics"] = "none"
     actor_learning_rate: Annotated[float, "Adam's step size for the actor", (0.0, 1.0)] = 3e-4
     critic_learning_rate: Annotated[float, "Adam's step size for the critics", (0.0, 1.0)] = 1e-3
     temperature_learning_rate: Annotated[float, "Adam's step size for the temperature", (0.0, 1.0)] = 1e-3
@@ -145,8 +145,8 @@ class SAC:
         action, log_prob = networks.sample(self.policy(state.actor, actor_next), target_key)
         log_prob -= self.log_scale(windows)
         if self.critic_norm == "batch":
-            later, rates = jnp.concatenate([critic_next, action], -1), (self.critic_learning_rate, self.discount)
-            state, metrics = learn_in_one_pass(state, windows, critic_now, later, log_prob, *rates)
+            options = {"learning_rate": self.critic_learning_rate, "discount": self.discount}
+            state, metrics = learn_in_one_pass(state, windows, critic_now, critic_next, action, log_prob, **options)
         else:
             next_value = soft_value(networks.twin(state.target, critic_next, action), log_prob, temperature)
             state, metrics = self.learn_critic(state, windows, critic_now, next_value)
@@ -180,12 +180,13 @@ class SAC:
         self, state: State, actor_input: Array, critic_input: Array, key: Key, penalty: Penalty = no_penalty
     ) -> State:
         """Take one gradient step on the actor towards higher soft values (VDPO eq. 9)."""
-        temperature, critic = jnp.exp(state.log_temperature), plain(state.critic, state.target)
+        temperature = jnp.exp(state.log_temperature)
 
         def loss(actor: Params) -> tuple[Array, None]:
             policy = self.policy(actor, actor_input)
             action, log_prob = networks.sample(policy, key)
-            value = soft_value(networks.twin(critic, critic_input, action), log_prob, temperature)
+            q = q_values(state.critic, state.target, critic_input, action)
+            value = soft_value(q, log_prob, temperature)
             return penalty(actor, policy) - value.mean(), None
 
         adam = optax.adam(self.actor_learning_rate)

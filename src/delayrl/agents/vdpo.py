@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from delayrl.agents import sac
 from delayrl.agents.base import Agent, Deterministic, Phase, descend
-from delayrl.agents.critics import lower_q, plain
+from delayrl.agents.critics import lower_q
 from delayrl.core import networks
 from delayrl.core.networks import Gaussian, Params
 from delayrl.core.objectives import gaussian_kl, masked_mean
@@ -146,8 +146,7 @@ class VDPO:
             return reference
         if self.behaviour == "mixture":
             return jnp.where(jax.random.bernoulli(coin_key), reference, delayed)
-        critic = plain(state.reference.critic, state.reference.target)
-        return lower_q(critic, truth, reference, delayed)
+        return lower_q(state.reference.critic, state.reference.target, truth, reference, delayed)
 
     def deterministic(self, state: State) -> Deterministic:
         """Return encoder and policy head, and the reference for age 0."""

@@ -1,4 +1,4 @@
-"""Losses and targets on plain arrays, each with its equation."""
+"""Losses and targets, each with its equation."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def soft_target(
 
 
 def k_step_target(windows: Window, discount: float, next_value: Float[Array, " batch"]) -> Float[Array, " batch"]:
-    """Return the soft target of step t of each window, for its own k, given V(s_{t+k})."""
+    """Return y = Σ_{j<k} γ^j r_{t+j} + γ^k (1 - terminated) V(s_{t+k}) of each window, with its own k (VDPO eq. 8)."""
     last = windows.delay + windows.n_step - 1
     return soft_target(
         k_step_return(windows.reward[:, windows.delay :], discount, windows.n_step),
@@ -37,8 +37,8 @@ def k_step_target(windows: Window, discount: float, next_value: Float[Array, " b
     )
 
 
-def squared_errors(q: Float[Array, "2 *batch"], target: Float[Array, "*batch"]) -> Float[Array, ""]:
-    """Return the sum of both critics' mean squared errors (VDPO eq. 8). No gradient goes through the target."""
+def squared_errors(q: Float[Array, "2 batch"], target: Float[Array, " batch"]) -> Float[Array, ""]:
+    """Return Σ_i mean (Q_i - y)², the loss of two critics. No gradient goes through y, the target."""
     return ((q - jax.lax.stop_gradient(target)) ** 2).mean(-1).sum()
 
 
