@@ -185,8 +185,7 @@ class SAC:
         def loss(actor: Params) -> tuple[Array, None]:
             policy = self.policy(actor, actor_input)
             action, log_prob = networks.sample(policy, key)
-            q = q_values(state.critic, state.target, critic_input, action)
-            value = soft_value(q, log_prob, temperature)
+            value = soft_value(q_values(state.critic, state.target, critic_input, action), log_prob, temperature)
             return penalty(actor, policy) - value.mean(), None
 
         adam = optax.adam(self.actor_learning_rate)
