@@ -316,7 +316,7 @@ def minimum_numbers(count: int = 4) -> None:
 
 
 def any_age_numbers() -> None:
-    heading("Any-age at constant weight: return at age 0; late: no pull; KL 10; squares 0.1, 1, 10; best; then gaps")
+    heading("Any-age at constant weight: return at age 0; late: no pull, loss, KL 10, squares 0.1, 1, 10, best; gaps")
     print(" " * 4 + "gaps: largest difference in probability from no pull, of KL 10 and squares 0.1, 1, 10")
     problems = [(f"random MDP {seed}", tab.random_mdp(np.random.default_rng(seed)), 2, 0.3) for seed in range(4)]
     problems += [(f"tracking, delay {delay}", tab.tracking(), delay, 0.1) for delay in (1, 2, 3)]
@@ -326,7 +326,7 @@ def any_age_numbers() -> None:
         pulled = [fix.any_age_fixed_point(mdp, delay, temperature, *pull).policy for pull in pulls]
         returns = [tab.policy_return(delayed.mdp, policy) for policy in (bpql.policy, *pulled)]
         fresh = tab.policy_return(mdp, tab.softmax(bpql.q / temperature))
-        row(name, [fresh, *returns, tab.optimal_return(delayed.mdp)])
+        row(name, [fresh, returns[0], fresh - returns[0], *returns[1:], tab.optimal_return(delayed.mdp)])
         row("", [np.abs(policy - bpql.policy).max() for policy in pulled])
 
 

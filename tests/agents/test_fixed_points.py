@@ -102,15 +102,15 @@ def windows(delay: int) -> Window:
     )
 
 
-def run(update: Any, state: Any, batch: Window, updates: int) -> Any:
-    """Apply an agent's update many times to one batch."""
+def run(update: Any, state: Any, batch: Window, updates: int, first: int = 0) -> Any:
+    """Apply an agent's update many times to one batch, the first of them at a later step of the run if asked."""
 
     @jax.jit
     def loop(state: Any, batch: Window) -> Any:
         def step(state: Any, i: Any) -> tuple[Any, None]:
             return update(state, batch, jax.random.fold_in(jax.random.key(0), i), i)[0], None
 
-        return jax.lax.scan(step, state, jnp.arange(updates))[0]
+        return jax.lax.scan(step, state, first + jnp.arange(updates))[0]
 
     return loop(state, batch)
 
@@ -286,13 +286,32 @@ def test_any_age_ends_where_its_pull_leaves_it(encoder: Any, weight: float, dist
     agent = AnyAge(bpql, pull_weight=weight, pull=distance, encoder=encoder, **constant)
     state = agent.init(Spec(STATES, 1, 1), jax.random.key(1))
     for rate, updates in ((1e-2, 1200), (1e-3, 300)):
-        agent = replace(agent, bpql=with_options(bpql, actor_learning_rate=rate, critic_learning_rate=rate))
-        state = run(agent.update, state, windows(1), updates)
+        state = run(learning_at(rate, agent).update, state, windows(1), updates)
     np.testing.assert_allclose(q_table(state.critic), [solution.q[:, AT_ACTIONS]] * 2, atol=Q_MARGIN)
     bpql = agent.learner
     assert_gaussians(bpql.policy(state.actor, histories()), *late(solution))
     fresh = jnp.concatenate([jnp.eye(STATES), jnp.zeros((STATES, 2))], -1)  # x_t of age 0
     assert_gaussians(bpql.policy(state.actor, fresh), solution.current.mean, np.exp(solution.current.log_std))
+
+
+def learning_at(rate: float, agent: AnyAge) -> AnyAge:
+    return replace(agent, bpql=with_options(agent.bpql, actor_learning_rate=rate, critic_learning_rate=rate))
+
+
+@pytest.mark.slow
+def test_an_annealed_pull_leaves_no_bias() -> None:
+    """Its weight holds for 800 updates, in which the policy narrows, and is 0 from 1,200 on: it ends at BPQL's."""
+    solution, bpql = expected("bpql"), AGENTS["bpql"]
+    annealed = {"pull_weight": 1.0, "pull_hold": 0.5, "pull_end": 0.75, "run_steps": 1600, "second_age": "zero"}
+    agent = AnyAge(bpql, encoder="mlp", **annealed)
+    state = agent.init(Spec(STATES, 1, 1), jax.random.key(1))
+    state = run(learning_at(1e-2, agent).update, state, windows(1), 800)
+    held = bpql.policy(state.actor, histories()).log_std
+    assert (late(solution)[1] - np.exp(held)).max() > 0.3
+    state = run(learning_at(1e-2, agent).update, state, windows(1), 800, first=800)
+    state = run(learning_at(1e-3, agent).update, state, windows(1), 300, first=1600)
+    np.testing.assert_allclose(q_table(state.critic), [solution.q[:, AT_ACTIONS]] * 2, atol=Q_MARGIN)
+    assert_gaussians(agent.learner.policy(state.actor, histories()), *late(solution))
 
 
 # ---- Imitation ---------------------------------------------------------------------------------------------

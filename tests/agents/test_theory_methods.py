@@ -22,6 +22,7 @@ from fixed_points import (
 from gaussians import moment_match
 from scipy.optimize import minimize_scalar
 from tabular import (
+    MDP,
     augment,
     geometric_mean,
     guessing_game,
@@ -173,6 +174,17 @@ def test_a_pull_by_kl_has_no_bias(seed: int, younger: int) -> None:
 def any_age_objective(averaged: np.ndarray, temperature: float, weight: float):
     """½ E[α log π - Q] + w Σ π log π, to which the pull adds -w Σ π E[log π_j]."""
     return lambda p: ((0.5 * temperature + weight) * p * np.log(p) - 0.5 * p * averaged).sum(1)
+
+
+@pytest.mark.parametrize(
+    ("mdp", "delay", "temperature", "fresh", "late"),
+    [(random_mdp(np.random.default_rng(0)), 2, 0.3, 5.442, 4.087), (tracking(), 1, 0.1, 19.999, 18.095)],
+)
+def test_what_the_delay_costs_any_age(mdp: MDP, delay: int, temperature: float, fresh: float, late: float) -> None:
+    """Returns of one agent's policies at age 0 and at age Δ, as in the table of `docs/theory.md`."""
+    q, policy = bpql_fixed_point(mdp, delay, temperature)
+    assert policy_return(mdp, softmax(q / temperature)) == pytest.approx(fresh, abs=1e-3)
+    assert policy_return(augment(mdp, delay).mdp, policy) == pytest.approx(late, abs=1e-3)
 
 
 @two_seeds
