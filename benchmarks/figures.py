@@ -288,8 +288,7 @@ def main() -> None:
         delayrl(["bench", "report", str(rows), "--out", str(root / "docs" / "results" / folder)])
     text = learning.section(HERE / "results" / "learning", images / "learning.png")
     insert(root / "docs" / "benchmarks.md", "learning", text)
-    rows = [HERE / "results" / f"{name}.sqlite" for name in ("any-age-ladder", "any-age-crossq")]
-    arms, goals = ladder.sections(rows, images / "ladder.png")
+    arms, goals = ladder.sections(HERE / "results" / "any-age-ladder.sqlite", images / "ladder.png")
     insert(root / "docs" / "algorithms" / "any-age.md", "ladder", arms)
     insert(root / "docs" / "algorithms" / "any-age-trials.md", "goals", goals)
     usual, every = (HERE / "results" / f"halfcheetah-ages{name}.jsonl" for name in ("", "-any"))

@@ -9,7 +9,6 @@ import itertools
 import textwrap
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +41,6 @@ TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
 BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
 BPQL_BATCH, SAC_BATCH = BATCH.replace("any-age", "bpql"), "`sac`, no delay, `critic_norm=batch`"
-EARLIER = {"crossq:ANY_AGE": "any-age", "crossq:BPQL": "bpql", "crossq:DELAY_FREE": "sac"}
-"""Agents that had critics with batch norm before there was `critic_norm=batch`."""
 GOALS = [
     (WHOLE, "`bpql`, its released settings", "1.5"),
     (WHOLE, BASE, ""),
@@ -77,38 +74,28 @@ GOALS = [
 """Two arms, and the ratio of their returns that is aimed at."""
 
 
-def sections(files: list[Path], picture: Path) -> tuple[str, str]:
+def sections(file: Path, picture: Path) -> tuple[str, str]:
     """Draw the curves; return the tables of all arms, with what made them, and of the goals."""
-    tables = [read_table(file) for file in files]
-    standing = itertools.chain.from_iterable(collected.standing for collected in tables)
-    cells = [(cell, progress) for cell, progress in standing if progress.state == "done"]
+    collected = read_table(file)
+    cells = [(cell, progress) for cell, progress in collected.standing if progress.state == "done"]
     check_seeds(cell for cell, _ in cells)
-    rows = itertools.chain.from_iterable(collected.rows for collected in tables)
-    configs = itertools.chain.from_iterable(collected.configs for collected in tables)
-    found = summarise(rows, cells, configs).results.values()
-    results = [replace(result, condition=as_option(result.condition)) for result in found if result.runs]
+    found = summarise(collected.rows, cells, collected.configs).results.values()
+    results = [result for result in found if result.runs]
     learners = sorted((r for r in results if r.condition.agent != "random"), key=lambda r: -area(r).mean())
     draw(learners, picture)
-    every = [used for collected in tables for *_, own in trained_with(collected) for used in own]
+    every = [used for *_, own in trained_with(collected) for used in own]
     made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
-    made += f"seeds, each of ten episodes. {made_on(every)} {rows_of(files, tables)}"
+    made += f"seeds, each of ten episodes. {made_on(every)} {rows_of([file], [collected])}"
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
-    slower = update_times(files[0].parent / "arms.jsonl")
+    slower = update_times(file.parent / "arms.jsonl")
     return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
-
-
-def as_option(condition: Condition) -> Condition:
-    """Return the condition with batch norm as an option, where an agent of its own had it."""
-    if condition.agent not in EARLIER:
-        return condition
-    return replace(condition, agent=EARLIER[condition.agent], overrides={**condition.overrides, "critic_norm": "batch"})
 
 
 def check_seeds(cells: Iterable[Cell]) -> None:
     """Raise DelayRLError where an arm has other seeds than 0 to n - 1, each once: seeds are paired by their place."""
     seeds: dict[str, list[int]] = defaultdict(list)
     for cell in cells:
-        seeds[arm(as_option(cell.condition))] += cell.seeds
+        seeds[arm(cell.condition)] += cell.seeds
     for words, own in seeds.items():
         if sorted(own) != [*range(len(own))]:
             raise DelayRLError(f"{words} has ended for seeds {sorted(own)}: each from 0 on is needed, and once")

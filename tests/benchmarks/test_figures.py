@@ -50,7 +50,7 @@ def test_the_result(tmp_path: Path) -> None:
     """On both first pages, with the parts of any-age and lost episodes."""
     result = figures.front.section(tables("evidence-1", "evidence-2", "any-age-ladder"), tmp_path)
     assert section("README.md", "result") == section("docs/index.md", "result") == result
-    arms, goals = figures.ladder.sections(tables("any-age-ladder", "any-age-crossq"), tmp_path / "ladder.png")
+    arms, goals = figures.ladder.sections(*tables("any-age-ladder"), tmp_path / "ladder.png")
     assert section("docs/algorithms/any-age.md", "ladder") == arms
     assert section("docs/algorithms/any-age-trials.md", "goals") == goals
 
