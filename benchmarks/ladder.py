@@ -87,8 +87,8 @@ def sections(file: Path, picture: Path) -> tuple[str, str]:
     made = "HalfCheetah-v5, preset `matched` unless said, `--precision bfloat16`. ± is the standard deviation over "
     made += f"seeds, each of ten episodes. {made_on(every)} {rows_of([file], [collected])}"
     commits = ", ".join(dict.fromkeys(str(used["commit"]) for used in every))
-    slower = update_times(file.parent / "arms.jsonl")
-    return f"{table(learners, slower)}\n\n{made} Commits: {commits}.", goals(learners)
+    times = update_times(file.parent / "arms.jsonl")
+    return f"{table(learners, times)}\n\n{made} Commits: {commits}.", goals(learners)
 
 
 def check_seeds(cells: Iterable[Cell]) -> None:
@@ -162,12 +162,12 @@ def base_of(result: Result) -> str:
     return WHOLE if own == alike else alike
 
 
-def table(results: list[Result], slower: Mapping[str, float] | None = None) -> str:
+def table(results: list[Result], times: Mapping[str, tuple[float, float]] | None = None) -> str:
     """Return a Markdown table of the arms, each minus its base seed by seed.
 
-    `slower` has the time of each arm's update over that of BPQL's.
+    `times` has the milliseconds of each arm's update, and their ratio to BPQL's.
     """
-    arms, slower = {name(r): r for r in results}, slower or {}
+    arms, times = {name(r): r for r in results}, times or {}
     head = ["arm", "over training", "minus its base", "at the end", "minus its base", f"above {AWAY:,}", "GFLOP"]
     body = []
     for result in results:
@@ -176,15 +176,18 @@ def table(results: list[Result], slower: Mapping[str, float] | None = None) -> s
             cells += [spread(values(result)), bold(paired(values(result), values(base))) if base else ""]
         final = result.curves.final
         cells += [f"{int((final > AWAY).sum())} of {final.size}", gflop(result)]
-        body.append([*cells, f"{slower[name(result)]:.2f}" if name(result) in slower else ""])
-    return markdown_table([*head, "update time"], body)
+        body.append([*cells, "{:.1f} ({:.2f})".format(*times[name(result)]) if name(result) in times else ""])
+    return markdown_table([*head, "update, ms"], body)
 
 
-def update_times(file: Path) -> dict[str, float]:
-    """Return the median ratio of each arm's update to BPQL's over the rounds of arms.py; nothing without its rows."""
+def update_times(file: Path) -> dict[str, tuple[float, float]]:
+    """Return the medians over the rounds of arms.py: of each arm's update in milliseconds, and of its ratio to BPQL's.
+
+    Nothing without its rows.
+    """
     rows = jsonl.read(file)[1:] if file.exists() else []
     known = {row["arm"]: np.array(row["ms"]) for row in rows}
-    return {arm: float(np.median(ms / known[BASE])) for arm, ms in known.items()}
+    return {arm: (float(np.median(ms)), float(np.median(ms / known[BASE]))) for arm, ms in known.items()}
 
 
 def goals(results: list[Result]) -> str:

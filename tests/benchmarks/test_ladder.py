@@ -32,12 +32,12 @@ def test_the_ladder_compares_each_arm_with_its_base() -> None:
     base = result("bpql", 25, [[1000.0, 1000.0], [1200.0, 1200.0]])
     whole = result("any-age", 25, [[2500.0, 2500.0], [2500.0, 1500.0], [9000.0, 9000.0]])
     arm = result("any-age", 25, [[2000.0, 2000.0], [2400.0, 1400.0]], pull_weight=0.0)
-    rows = ladder.table([whole, arm, base], {"`any-age`, `pull_weight=0.0`": 1.5}).splitlines()[2:]
+    rows = ladder.table([whole, arm, base], {"`any-age`, `pull_weight=0.0`": (7.25, 1.5)}).splitlines()[2:]
     lines = [line.strip("| ").split(" | ") for line in rows]
     assert lines[1][0] == "`any-age`, `pull_weight=0.0`"
     assert lines[1][2] == "-300 (-2,841 to +2,241)"  # gaps of 500 and 100, t = 12.706; the third seed has no other
     assert lines[1][4] == "-300 (-2,841 to +2,241)"
-    assert lines[1][5:] == ["1 of 2", "1.23", "1.50"]
+    assert lines[1][5:] == ["1 of 2", "1.23", "7.2 (1.50)"]
     assert lines[0][2] == "+1,150 (-3,297 to +5,597)"  # over training gaps of 1,500 and 800 from BPQL
     assert lines[0][4] == "+900 (-6,724 to +8,524)"  # at the end 1,500 and 300
     assert [lines[2][2], lines[2][4]] == ["", ""]
@@ -55,10 +55,10 @@ def test_the_ladder_compares_each_arm_with_its_base() -> None:
 
 
 def test_update_times_are_paired_by_round(tmp_path: Path) -> None:
-    """The median of the rounds' ratios; a round that met other work met it on both sides."""
+    """The medians of the rounds' milliseconds and of their ratios; a round that met other work met it on both sides."""
     rows = [{"versions": {}}, {"arm": "`any-age`", "ms": [2.0, 4.0, 90.0]}, {"arm": "`bpql`", "ms": [1.0, 2.0, 30.0]}]
     (tmp_path / "arms.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    assert ladder.update_times(tmp_path / "arms.jsonl") == {"`any-age`": 2.0, "`bpql`": 1.0}
+    assert ladder.update_times(tmp_path / "arms.jsonl") == {"`any-age`": (4.0, 2.0), "`bpql`": (2.0, 1.0)}
     assert ladder.update_times(tmp_path / "none.jsonl") == {}
 
 
