@@ -1,4 +1,4 @@
-"""Any-age beside other agents and simpler arms: the tables of differences in docs/algorithms/any-age.md."""
+"""Any-age beside other agents and simpler arms: the tables of differences in docs/algorithms/any-age-results.md."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -51,18 +51,18 @@ def test_the_result(tmp_path: Path) -> None:
     result = figures.front.section(tables("evidence-1", "evidence-2", "any-age-ladder"), tmp_path)
     assert section("README.md", "result") == section("docs/index.md", "result") == result
     arms, goals = figures.ladder.sections(*tables("any-age-ladder"), tmp_path / "ladder.png")
-    assert section("docs/algorithms/any-age.md", "ladder") == arms
+    assert section("docs/algorithms/any-age-results.md", "ladder") == arms
     assert section("docs/algorithms/any-age-trials.md", "goals") == goals
 
 
 @pytest.mark.thorough
 def test_comparisons(tmp_path: Path) -> None:
     rows = tables("evidence-1", "evidence-2", "any-age-ladder")
-    assert section("docs/algorithms/any-age.md", "against") == figures.against.section(rows)
+    assert section("docs/algorithms/any-age-results.md", "against") == figures.against.section(rows)
     poles = figures.against.section(rows, "InvertedDoublePendulum-v5")
-    assert section("docs/algorithms/any-age.md", "against-poles") == poles
-    assert section("docs/algorithms/any-age.md", "added-seeds") == figures.against.added(rows)
-    assert section("docs/algorithms/any-age.md", "simpler") == figures.against.simpler(rows)
+    assert section("docs/algorithms/any-age-results.md", "against-poles") == poles
+    assert section("docs/algorithms/any-age-results.md", "added-seeds") == figures.against.added(rows)
+    assert section("docs/algorithms/any-age-results.md", "simpler") == figures.against.simpler(rows)
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
     assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])
 
