@@ -61,7 +61,7 @@ def section(files: list[Path], env: str = ENV) -> str:
         f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where no "
         "other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are Welch's, "
         "of 95 %, and bold where they leave out 0. § stays clear after Holm's correction for all differences here at "
-        "the end, or over training. *Arithmetic* is that of a step of any-age over that of the other."
+        "the end, or over training. *Arithmetic* is that of a step of the other over any-age's."
     )
     if "†" in rows:
         about += " † acts on the true state while it trains; VDPO has `--tokens 1280`."
@@ -87,7 +87,7 @@ def table(results: list[Result], env: str = ENV) -> str:
     for (delay, own_name, name, own, other), end, whole in zip(pairs, ends, areas, strict=True):
         cells = [name, ended_at(other), bold(difference(own.curves.final, other.curves.final)) + " §" * end]
         cells += [bold(difference(area(own), area(other))) + " §" * whole]
-        ratio = f"{own.cost.flops / other.cost.flops:.2f}" if own.cost and other.cost else ""
+        ratio = f"{other.cost.flops / own.cost.flops:.2f}" if own.cost and other.cost else ""
         parts.setdefault(f"**Δ = {delay}**: {own_name} ends at {ended_at(own)}.", []).append([*cells, ratio])
     head = ["other agent", "ends at", "any-age minus it, at the end", "over training", "arithmetic"]
     return "\n\n".join(f"{title}\n\n{markdown_table(head, body)}" for title, body in parts.items())

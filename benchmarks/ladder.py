@@ -9,6 +9,7 @@ import itertools
 import textwrap
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -148,16 +149,20 @@ def arm(condition: Condition) -> str:
 def base_of(result: Result) -> str:
     """Return the arm that an arm is compared with: any-age with its batches, for those BPQL; none for BPQL and SAC.
 
-    That of BPQL with batch norm is BPQL with layer norm and as large batches.
+    That of BPQL with batch norm is BPQL with layer norm and as large batches. That of another encoder with a pull or
+    a belief loss is this encoder alone.
     """
-    agent, own = result.condition.agent, name(result)
+    agent, own, options = result.condition.agent, name(result), result.condition.overrides
+    if "encoder" in options and {"pull_weight", "belief_weight"} & options.keys():
+        more = ("pull_weight", "belief_weight", "second_age")
+        return arm(replace(result.condition, overrides={k: v for k, v in options.items() if k not in more}))
     if agent == "sac" or own == BASE:
         return ""
     if own == BPQL_BATCH:
         return HALF
     if agent == "bpql" or own == WHOLE:
         return BASE
-    size = result.condition.overrides.get("batch_size")
+    size = options.get("batch_size")
     alike = f"{WHOLE}, `batch_size={size}`" if size else WHOLE
     return WHOLE if own == alike else alike
 

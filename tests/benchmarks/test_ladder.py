@@ -52,6 +52,8 @@ def test_the_ladder_compares_each_arm_with_its_base() -> None:
     assert ladder.base_of(result("bpql", 25, [[0.0]], batch_size=128, critic_norm="batch")) == ladder.HALF
     whole = result("any-age", 25, [[0.0]], batch_size=128, critic_norm="batch")
     assert ladder.base_of(whole) == "`any-age`, `batch_size=128`"
+    flat = result("any-age", 25, [[0.0]], batch_size=128, encoder="mlp", pull_weight=1.0, second_age="zero")
+    assert ladder.base_of(flat) == "`any-age`, `batch_size=128`, `encoder=mlp`"
 
 
 def test_update_times_are_paired_by_round(tmp_path: Path) -> None:
