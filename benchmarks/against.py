@@ -16,6 +16,8 @@ from delayrl.report.statistics import Floats
 from delayrl.report.wording import normalised
 
 ENV, OWN = "HalfCheetah-v5", "`any-age`"
+BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
+"""Any-age's best arm at a constant delay, compared with other agents."""
 PLAIN = "`any-age`, `critic_norm=none`"
 """Compared with the agents whose critics have no layer normalisation either."""
 VARIANTS = (
@@ -27,8 +29,6 @@ VARIANTS = (
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
     "`any-age`, `batch_size=128`",
     "`any-age`, `batch_size=128`, `encoder=mlp`",
-    "`any-age`, `batch_size=128`, `critic_norm=batch`",
-    "`bpql`, `batch_size=128`, `critic_norm=batch`",
 )
 """Shown beside the arms of the first page."""
 SIMPLER = (
@@ -75,9 +75,9 @@ def table(results: list[Result], env: str = ENV) -> str:
         if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
     pairs = []
-    for own_name in (OWN, PLAIN):
+    for own_name in (OWN, BATCH, PLAIN):
         for (name, delay), other in chosen.items():
-            alike = own_name == OWN or not ("any-age" in name or "critic_norm" in name)
+            alike = own_name == OWN or not ("any-age" in name or (own_name == PLAIN and "critic_norm" in name))
             if alike and (own_name, delay) in chosen and own_name != name:
                 pairs.append((delay, own_name, name, chosen[own_name, delay], other))
     pairs.sort(key=lambda pair: (delay_order(pair[0]), pair[1], -area(pair[-1]).mean()))
