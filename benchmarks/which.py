@@ -16,7 +16,7 @@ from delayrl.report.summary import summarise
 from delayrl.report.wording import number
 
 HEAD = ("case", "highest return", "not shown to be lower", "lower", "not finished")
-BUDGET = {"precision", "steps", "evaluate_every", "random_steps", "replay_capacity", "tokens"}
+BUDGET = {"precision", "steps", "evaluate_every", "replay_capacity", "tokens"}
 """Overrides that leave an agent what it is."""
 WAITING = "@wait"
 """The end of a delay whose observations are held back for the longest one."""
