@@ -29,5 +29,7 @@ def test_the_result_of_the_first_page(tmp_path: Path) -> None:
     assert lines[0][1:] == ["**1.00**<br>3,900 ± 0"] * 3 + ["", "", " |"]
     assert lines[1][2] == "**0.30**<br>0.28 to 0.33; 2 seeds<br>1,100 ± 141"
     assert lines[2][4] == "**0.03**<br>0.03 to 0.04<br>30.0 ± 15.8"
+    shorter, other = of("bpql", late, [1.0], evaluate_every=2_000), of("bpql", late, [2.0], random_steps=20_000)
+    assert [front.name(arm) for arm in (shorter, other)] == ["`bpql`", "`bpql`, `random_steps=20000`"]
     front.draw(chosen, tmp_path / "result.png")
     assert (tmp_path / "result.png").stat().st_size > 5_000

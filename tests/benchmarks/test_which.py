@@ -92,15 +92,16 @@ def test_other_options_are_left_out_and_budgets_are_not() -> None:
     assert lines(normed, cell("vdpo", CLOSE)) == []
 
 
-def test_tokens_and_random_steps_are_a_budget() -> None:
-    """VDPO has them in `evidence-1`: it is still to be run before it has ended, and compared once it has."""
-    budget = {"precision": "bfloat16", "tokens": 1280, "random_steps": 1000}
+def test_tokens_are_a_budget_and_random_steps_an_option() -> None:
+    """VDPO has tokens in `evidence-1`: it is still to be run before it has ended, and compared once it has."""
+    budget = {"precision": "bfloat16", "tokens": 1280}
     vdpo = standing("vdpo", "Ant-v4", 5, 5, state="todo", step=0, steps=300, overrides=budget), []
     first = cell("bpql", LOW), cell("a-sac", CLOSE)
     ((*_, todo),) = lines(*first, vdpo)
     assert todo == "`vdpo`"
     ((*_, best, _, _, todo),) = lines(*first, cell("vdpo", HIGH, overrides=budget))
     assert (best, todo) == ("`vdpo` 12.0 raw (5)", "")
+    assert lines(cell("bpql", LOW), cell("vdpo", HIGH, overrides=budget | {"random_steps": 20_000})) == []
 
 
 def test_a_missing_table_is_said() -> None:
