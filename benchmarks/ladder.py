@@ -41,7 +41,7 @@ HALF = "`bpql`, `batch_size=128`, `critic_norm=layer`"
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
 BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
-BPQL_BATCH, SAC_BATCH = BATCH.replace("any-age", "bpql"), "`sac`, no delay, `critic_norm=batch`"
+BPQL_BATCH, SAC_BATCH = BATCH.replace("any-age", "bpql"), BATCH.replace("`any-age`", SAC)
 GOALS = [
     (WHOLE, "`bpql`, its released settings", "1.5"),
     (WHOLE, BASE, ""),
@@ -67,6 +67,7 @@ GOALS = [
     (BATCH, BPQL_BATCH, "1.15"),
     (BATCH, "`sac`, no delay, `critic_norm=layer`", ""),
     (BATCH, SAC_BATCH, "0.75"),
+    (BATCH, "`sac`, no delay, `critic_norm=batch`", ""),
     (BPQL_BATCH, "`bpql`, its released settings", ""),
     (BPQL_BATCH, HALF, ""),
     (BPQL_BATCH, "`sac`, no delay, `critic_norm=layer`", ""),
