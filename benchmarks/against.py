@@ -5,7 +5,7 @@ from pathlib import Path
 
 import front
 import numpy as np
-from ladder import area, read_table
+from ladder import BATCH, area, read_table
 from learning.curves import bold, difference, spread
 from scipy import stats
 from which import results_of
@@ -16,10 +16,10 @@ from delayrl.report.statistics import Floats
 from delayrl.report.wording import normalised
 
 ENV, OWN = "HalfCheetah-v5", "`any-age`"
-BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
-"""Any-age's best arm at a constant delay, compared with other agents."""
 PLAIN = "`any-age`, `critic_norm=none`"
 """Compared with the agents whose critics have no layer normalisation either."""
+LEFT_OUT: dict[str, tuple[str, ...]] = {OWN: (), BATCH: ("any-age",), PLAIN: ("any-age", "critic_norm")}
+"""The arms with tables of their own, and the words in the names of others that are left out of them."""
 VARIANTS = (
     PLAIN,
     "`any-age`, `encoder=mlp`",
@@ -39,7 +39,7 @@ SIMPLER = (
     "`any-age`, `batch_size=128`, `encoder=mlp`",
     "`bpql`, `critic_norm=layer`",
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
-    "`any-age`, `batch_size=128`, `critic_norm=batch`",
+    BATCH,
     "`bpql`, `batch_size=128`, `critic_norm=batch`",
     "`bpql`",
 )
@@ -75,9 +75,9 @@ def table(results: list[Result], env: str = ENV) -> str:
         if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
     pairs = []
-    for own_name in (OWN, BATCH, PLAIN):
+    for own_name, words in LEFT_OUT.items():
         for (name, delay), other in chosen.items():
-            alike = own_name == OWN or not ("any-age" in name or (own_name == PLAIN and "critic_norm" in name))
+            alike = not any(word in name for word in words)
             if alike and (own_name, delay) in chosen and own_name != name:
                 pairs.append((delay, own_name, name, chosen[own_name, delay], other))
     pairs.sort(key=lambda pair: (delay_order(pair[0]), pair[1], -area(pair[-1]).mean()))

@@ -288,21 +288,22 @@ def main() -> None:
         delayrl(["bench", "report", str(rows), "--out", str(root / "docs" / "results" / folder)])
     text = learning.section(HERE / "results" / "learning", images / "learning.png")
     insert(root / "docs" / "benchmarks.md", "learning", text)
+    any_age = root / "docs" / "algorithms" / "any-age-results.md"
     arms, goals = ladder.sections(HERE / "results" / "any-age-ladder.sqlite", images / "ladder.png")
-    insert(root / "docs" / "algorithms" / "any-age-results.md", "ladder", arms)
+    insert(any_age, "ladder", arms)
     insert(root / "docs" / "algorithms" / "any-age-trials.md", "goals", goals)
     usual, every = (HERE / "results" / f"halfcheetah-ages{name}.jsonl" for name in ("", "-any"))
     title, wide = "HalfCheetah-v5, trained under uniform:1:25, five seeds", "any-age second_age=any"
     played = sweeps.read(usual) | {wide: sweeps.read(every)["any-age"]}
     sweeps.draw(played, title, images / "ages.png", COLOURS | {wide: STYLES["any-age"][1]})
     for name, file in {"ages": usual, "ages-any": every}.items():
-        insert(root / "docs" / "algorithms" / "any-age-results.md", name, sweeps.section(file, "any-age"))
+        insert(any_age, name, sweeps.section(file, "any-age"))
     rows = [HERE / "results" / f"{name}.sqlite" for name in ("evidence-1", "evidence-2", "any-age-ladder")]
-    insert(root / "docs" / "algorithms" / "any-age-results.md", "against", against.section(rows))
+    insert(any_age, "against", against.section(rows))
     poles = against.section(rows, "InvertedDoublePendulum-v5")
-    insert(root / "docs" / "algorithms" / "any-age-results.md", "against-poles", poles)
-    insert(root / "docs" / "algorithms" / "any-age-results.md", "added-seeds", against.added(rows))
-    insert(root / "docs" / "algorithms" / "any-age-results.md", "simpler", against.simpler(rows))
+    insert(any_age, "against-poles", poles)
+    insert(any_age, "added-seeds", against.added(rows))
+    insert(any_age, "simpler", against.simpler(rows))
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)

@@ -59,7 +59,9 @@ TABLE_ONLY = (
     "`bpql`, `critic_norm=layer`",
     "`any-age`, `batch_size=128`, `encoder=mlp`",
 )
-"""More rows of the table."""
+"""Rows of the table that the picture leaves out."""
+ARMS = {*COLOURS, *TABLE_ONLY}
+"""All rows of the table."""
 
 
 def section(files: list[Path], pictures: Path) -> str:
@@ -96,7 +98,7 @@ def choose(results: list[Result]) -> Chosen:
 def comparable(results: list[Result], more: Collection[str] = ()) -> list[Result]:
     """Return the results of the arms here and of `more`, at the budget of their task, those with most seeds last."""
     alike = [r for r in results if r.condition.preset == "matched" and r.condition.steps == STEPS.get(r.place.env)]
-    return sorted((r for r in alike if ended(r) and name(r) in {*COLOURS, *TABLE_ONLY, *more}), key=lambda r: r.runs)
+    return sorted((r for r in alike if ended(r) and name(r) in ARMS.union(more)), key=lambda r: r.runs)
 
 
 def older(tables: list[Collected]) -> set[tuple[str, Case]]:

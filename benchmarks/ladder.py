@@ -41,6 +41,7 @@ HALF = "`bpql`, `batch_size=128`, `critic_norm=layer`"
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
 """As much arithmetic as WHOLE: half of the batch, two updates a step."""
 BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
+"""Any-age's best arm at a constant delay."""
 BPQL_BATCH, SAC_BATCH = BATCH.replace("any-age", "bpql"), BATCH.replace("`any-age`", SAC)
 GOALS = [
     (WHOLE, "`bpql`, its released settings", "1.5"),
