@@ -17,6 +17,7 @@ import ladder
 import lost
 import matplotlib
 import numpy as np
+import pairs
 import sweeps
 import which
 
@@ -307,6 +308,8 @@ def main() -> None:
     result = front.section(rows, images)
     for page in ("README.md", "docs/index.md"):
         insert(root / page, "result", result)
+    for key, text in pairs.sections(rows).items():
+        insert(root / "docs" / "benchmarks.md", key, text)
     insert(root / "docs" / "benchmarks.md", "lost", lost.section(rows, images / "lost.png"))
     insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
     text = times.section(HERE / "results" / "times", images / "times.png")

@@ -63,6 +63,8 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/algorithms/any-age-results.md", "against-poles") == poles
     assert section("docs/algorithms/any-age-results.md", "added-seeds") == figures.against.added(rows)
     assert section("docs/algorithms/any-age-results.md", "simpler") == figures.against.simpler(rows)
+    for key, text in figures.pairs.sections(rows).items():
+        assert section("docs/benchmarks.md", key) == text, key
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
     assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])
 
