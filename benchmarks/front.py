@@ -43,7 +43,6 @@ COLOURS = {
     "`sac`, no delay, `critic_norm=batch`": STYLES["random"][0],
     "`any-age`": STYLES["any-age"][0],
     "`any-age`, `batch_size=128`, `critic_norm=batch`": "#7a0019",
-    "`any-age`, `forecast_error=distance`": STYLES["any-age"][1],
     "`vdpo` †": STYLES["vdpo"][0],
     "`lifting`": STYLES["lifting"][0],
     "`bpql`": STYLES["bpql"][0],
@@ -53,15 +52,15 @@ COLOURS = {
     "`dcac`": STYLES["dcac"][0],
     "`sac-memoryless`": STYLES["sac-memoryless"][0],
 }
-"""What the picture shows. Agents have the colours of reports."""
-TABLE_ONLY = (
+"""What the table and the picture show. Agents have the colours of reports."""
+MORE = (
     "`sac`, no delay, `critic_norm=layer`",
-    "`bpql`, `critic_norm=layer`",
+    "`any-age`, `forecast_error=distance`",
     "`any-age`, `batch_size=128`, `encoder=mlp`",
+    "`bpql`, `critic_norm=layer`",
 )
-"""Rows of the table that the picture leaves out."""
-ARMS = {*COLOURS, *TABLE_ONLY}
-"""All rows of the table."""
+ARMS = {*COLOURS, *MORE}
+"""What other pages show."""
 
 
 def section(files: list[Path], pictures: Path) -> str:
@@ -91,7 +90,8 @@ def choose(results: list[Result]) -> Chosen:
     chosen: Chosen = {}
     for result in comparable(results):
         task, own = result.place.env, result.place.delay
-        chosen |= {(name(result), (env, delay)): result for env, delay in CASES if env == task and own in (0, delay)}
+        here = [case for case in CASES if name(result) in COLOURS and case[0] == task and own in (0, case[1])]
+        chosen |= {(name(result), case): result for case in here}
     return chosen
 
 
