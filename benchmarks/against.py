@@ -28,7 +28,7 @@ VARIANTS = (
     "`bpql`, `batch_size=128`",
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
     "`any-age`, `batch_size=128`",
-    "`any-age`, `batch_size=128`, `encoder=mlp`",
+    "`any-age`, `batch_size=128`, `critic_norm=batch`, `encoder=mlp`",
 )
 """Shown beside the arms of the first page."""
 SIMPLER = (
