@@ -5,10 +5,9 @@ from pathlib import Path
 
 import front
 import numpy as np
-from ladder import BATCH, area, read_table
+from ladder import BATCH, SAC_BATCH, area, read_table
 from learning.curves import bold, difference, spread
 from scipy import stats
-from which import results_of
 
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, delay_order
@@ -29,6 +28,7 @@ VARIANTS = (
     "`bpql`, `batch_size=128`, `critic_norm=layer`",
     "`any-age`, `batch_size=128`",
     "`any-age`, `batch_size=128`, `critic_norm=batch`, `encoder=mlp`",
+    SAC_BATCH,
 )
 """Shown beside the arms of the first page."""
 SIMPLER = (
@@ -56,7 +56,7 @@ WHERE: dict[str, tuple[str, int | str]] = {
 
 def section(files: list[Path], env: str = ENV) -> str:
     """Return the tables of a task from the cells that have ended, with what their words mean."""
-    rows = table(results_of(map(read_table, files)), env)
+    rows = table(front.results_of(map(read_table, files)), env)
     about = (
         f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where no "
         "other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are Welch's, "
@@ -95,7 +95,7 @@ def table(results: list[Result], env: str = ENV) -> str:
 
 def added(files: list[Path]) -> str:
     """Return the table of any-age's seeds in two halves: those of the plan, and those that were added later."""
-    return added_table(results_of(map(read_table, files)))
+    return added_table(front.results_of(map(read_table, files)))
 
 
 def added_table(results: list[Result], delay: int = 25) -> str:
@@ -129,7 +129,7 @@ def simpler(files: list[Path]) -> str:
         "and (↓) over training alone; ↑ and (↑) are above it, by Welch's interval of 95 % for each cell, without a "
         "correction for their number. *Arithmetic* is that of a step over any-age's. An empty cell has not run."
     )
-    return f"{simpler_table(results_of(map(read_table, files)))}\n\n{about}"
+    return f"{simpler_table(front.results_of(map(read_table, files)))}\n\n{about}"
 
 
 def simpler_table(results: list[Result]) -> str:

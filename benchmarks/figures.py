@@ -19,7 +19,6 @@ import matplotlib
 import numpy as np
 import pairs
 import sweeps
-import which
 
 matplotlib.use("Agg")
 from learning import curves as learning
@@ -316,8 +315,6 @@ def main() -> None:
     insert(root / "docs" / "performance.md", "times", text)
     insert(root / "docs" / "performance.md", "costs", costs("HalfCheetah-v5", (5, 25, 50)))
     insert(root / "docs" / "which-agent.md", "relative-costs", relative_costs("HalfCheetah-v5", (5, 25, 50)))
-    rows = [HERE / "results" / f"{name}.sqlite" for name in ("first", "evidence-1", "evidence-2", "any-age-ladder")]
-    insert(root / "docs" / "which-agent.md", "which", which.section(rows))
     for key, text in speed.pages(root).items():
         insert(HERE / "speed" / "README.md" if key in DETAILS else root / "docs" / "performance.md", key, text)
 

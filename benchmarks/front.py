@@ -1,19 +1,19 @@
 """The result on the first page: what each method is worth, from the cells of `evidence-1` and `-2` that have ended."""
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
 from ladder import arm, made_on, read_table, rows_of, spread, trained_with
 from learning.curves import curve
 from matplotlib import pyplot
-from which import BUDGET, ended, results_of
 
 from delayrl.bench.results import Collected
 from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
+from delayrl.report.summary import summarise
 from delayrl.report.wording import interval, normalised
 from delayrl.run.condition import Condition
 
@@ -36,6 +36,8 @@ STEPS = {
     "InvertedDoublePendulum-v5": 30_000,
 }
 SEEDS = 5
+BUDGET = {"precision", "steps", "evaluate_every", "replay_capacity", "tokens"}
+"""Overrides that leave an agent what it is."""
 OLDER = {"01b5aa23787f", "306d0e2c45c5", "3ee61c16dc1c", "6441e5f11602", "730fe4a4960b", "752d29b5f225", "e50179b9d693"}
 """Commits from before the mistake of docs/benchmarks.md, "A mistake in older rows", was fixed."""
 COLOURS = {
@@ -83,6 +85,16 @@ def section(files: list[Path], pictures: Path) -> str:
         f"{made_on(used)} {rows_of(files, tables)}"
     )
     return f"{table(chosen, older(tables))}\n\n{made}"
+
+
+def results_of(tables: Iterable[Collected]) -> list[Result]:
+    """Return the results of all tables."""
+    return [r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()]
+
+
+def ended(result: Result) -> bool:
+    """Tell whether all seeds have."""
+    return result.runs == result.seeds and not result.partial
 
 
 def choose(results: list[Result]) -> Chosen:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from against import VARIANTS
 from front import ARMS, COLOURS, STEPS, in_words
 from ladder import AWAY, read_table, rows_of
 from matplotlib import pyplot
@@ -48,7 +49,7 @@ def section(files: list[Path], picture: Path) -> str:
 
 
 def episodes(table: Collected) -> dict[Policy, Runs]:
-    """Return what the policies of the first page's table returned, those of which all cells have ended.
+    """Return what the policies of the pages' tables returned, those of which all cells have ended.
 
     A reference, which is evaluated without delay, stands at the delay of the policy that is cloned from it. Raises
     DelayRLError if a seed of a policy is there twice.
@@ -64,7 +65,7 @@ def episodes(table: Collected) -> dict[Policy, Runs]:
         if condition is None or policy_of(condition) in late:
             continue
         words = CHANCE if condition.agent == CHANCE else in_words(condition, row["privileged"])
-        if words == CHANCE or words in ARMS:
+        if words == CHANCE or words in ARMS.union(VARIANTS):
             words += ", its reference without delay" if row["policy"] == "reference" else ""
             policy, seed = (condition.delay, words), row["seed"]
             if cell_of.setdefault((policy, seed), row["cell"]) != row["cell"]:

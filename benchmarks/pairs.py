@@ -1,13 +1,13 @@
 """Who is clearly above whom: the tables of docs/benchmarks.md, "Case by case", from the cells that have ended."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
+from typing import Any
 
 from against import VARIANTS, welch
-from front import SEEDS, comparable, name
+from front import SEEDS, comparable, in_words, name, older, results_of
 from ladder import area, gflop, read_table
 from learning.curves import spread
-from which import WAITING, plant, results_of
 
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
@@ -26,19 +26,23 @@ CASES: dict[str, tuple[str, int | str]] = {
     "poles-10": ("InvertedDoublePendulum-v5", 10),
 }
 """Task and delay of each table."""
+WAITING = "@wait"
+"""The end of a delay whose observations are held back for the longest one."""
 HEAD = ["arm", "normalised", "at the end", "over training", "clearly above, at the end", "over training", "GFLOP"]
 
 
 def sections(files: list[Path]) -> dict[str, str]:
     """Return the table of each case."""
-    results = results_of(map(read_table, files))
-    return {key: table(results, *case) for key, case in CASES.items()}
+    tables = [read_table(file) for file in files]
+    results, marked = results_of(tables), older(tables)
+    return {key: table(results, *case, marked) for key, case in CASES.items()}
 
 
-def table(results: list[Result], env: str, delay: int | str) -> str:
+def table(results: list[Result], env: str, delay: int | str, marked: Collection[Any] = ()) -> str:
     """Return a Markdown table of the arms that have ended at a delay, and of SAC without one, the highest first.
 
-    An arm is clearly above those whose numbers it names: Welch's interval of 95 % of the difference leaves out 0.
+    An arm is clearly above those whose numbers it names: Welch's interval of 95 % of the difference leaves out 0. ° is
+    on those `marked`.
     """
     own = [r for r in comparable(results, VARIANTS) if r.place.env == env and plant(r) in (0, delay)]
     arms = {label(result): result for result in own}  # those with most seeds come last
@@ -46,7 +50,7 @@ def table(results: list[Result], env: str, delay: int | str) -> str:
     ends, areas = [result.curves.final for _, result in ranked], [area(result) for _, result in ranked]
     body = [
         [
-            *(f"**{place + 1}** {words}{seeds(result)}", normalised(result.final.mean())),
+            *(f"**{place + 1}** {words}{note(result, marked)}", normalised(result.final.mean())),
             *(spread(values[place]).replace(" ", "&nbsp;") for values in (ends, areas)),
             *(above(place, ends), above(place, areas), gflop(result)),
         ]
@@ -60,9 +64,16 @@ def label(result: Result) -> str:
     return name(result) + (f", `{WAITING}`" if plant(result) != result.place.delay else "")
 
 
-def seeds(result: Result) -> str:
-    """Write the number of seeds if it is another than usual."""
-    return f" ({result.runs} seeds)" if result.runs != SEEDS else ""
+def note(result: Result, marked: Collection[Any]) -> str:
+    """Write ° if the arm has rows from before the mistake, and the number of seeds if it is another than usual."""
+    old = (in_words(result.condition, False), (result.place.env, result.place.delay)) in marked
+    return " °" * old + (f" ({result.runs} seeds)" if result.runs != SEEDS else "")
+
+
+def plant(result: Result) -> int | str:
+    """Return the delay, without the rule to wait."""
+    delay = result.place.delay
+    return delay.removesuffix(WAITING) if isinstance(delay, str) else delay
 
 
 def above(place: int, values: list[Floats]) -> str:

@@ -66,7 +66,6 @@ def test_comparisons(tmp_path: Path) -> None:
     for key, text in figures.pairs.sections(rows).items():
         assert section("docs/benchmarks.md", key) == text, key
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
-    assert section("docs/which-agent.md", "which") == figures.which.section([*tables("first"), *rows])
 
 
 THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in ("evidence-1", "evidence-2")]

@@ -59,7 +59,7 @@ def test_the_table_has_each_policy_that_has_ended(tmp_path: Path, monkeypatch: p
         cell("any-age", 25, {0: {"agent": HIGH}}, state="running"),
         cell("lifting", 25, {0: {"agent": HIGH}}, id="ended"),
         cell("lifting", 25, {}, id="not begun", state="todo"),
-        cell("bpql", 25, {0: {"agent": HIGH}}, overrides={"batch_size": 128}),
+        cell("bpql", 25, {0: {"agent": HIGH}}, overrides={"batch_size": 64}),
         cell("bpql", 25, {0: {"agent": HIGH}}, steps=50_000),
         cell("bpql", "uniform:1:25", {0: {"agent": HIGH}}),
         cell("bpql", 25, {0: {"agent": HIGH}}, env="Ant-v5"),
