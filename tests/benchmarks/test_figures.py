@@ -68,7 +68,7 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
 
 
-THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in ("evidence-1", "evidence-2")]
+THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in ("evidence-1", "evidence-1-paper", "evidence-2")]
 
 
 @pytest.mark.parametrize("name", ["first", *THOROUGH])

@@ -16,7 +16,8 @@ from delayrl.report.statistics import NAN
 
 Kind = Literal["normalised", "steps", "ablation", "stochastic"]
 PAPER_STEPS = 1_000_000
-SAME_RUN = {"representation", "steps", "evaluate_every", "evaluation_episodes"}  # overrides that the paper's runs allow
+SAME_RUN = {"representation", "steps", "evaluate_every", "evaluation_episodes", "precision"}
+"""Overrides of runs that the paper's values may stand beside."""
 
 
 class PublishedValue(NamedTuple):
@@ -95,11 +96,10 @@ def make_tables(results: Collection[Result]) -> list[Table]:
 
 
 def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Table:
-    """Lay out the chosen results. The paper's columns are there only if all have its preset and budget."""
+    """Lay out the chosen results. The paper's columns are there only if all are comparable."""
     rows = sorted({(r.place.env, r.place.delay) for r in chosen}, key=lambda row: (row[0], delay_order(row[1])))
     columns = {r.place.label for r in chosen}
-    comparable = setting.preset == "paper" and all(r.condition.steps == PAPER_STEPS for r in chosen)
-    values = published_values() if comparable else {}
+    values = published_values() if all(_comparable(kind, r) for r in chosen) else {}
     in_paper = {(task, delay) for _, task, delay, *_ in values}
     if kind != "ablation" and any((env.removeprefix("delayrl/"), str(delay)) in in_paper for env, delay in rows):
         agents = {column.split(" ")[0] for column in columns}
@@ -124,6 +124,12 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Ta
     rows = [row for row in rows if any((*row, label) in shown for label in columns - plain)]
     columns = {label for label in columns if any((*row, label) in shown for row in rows)}
     return Table(kind, title, setting, rows, sorted(columns, key=agent_order), entries)
+
+
+def _comparable(kind: Kind, result: Result) -> bool:
+    """Whether a result has the paper's preset and budget. For steps to the threshold, that of the reference counts."""
+    budgets = {result.condition.steps} | ({result.threshold_anchor.steps} if kind == "steps" else set())
+    return result.place.setting.preset == "paper" and PAPER_STEPS in budgets
 
 
 def _published_key(kind: Kind, env: str, delay: int | str, agent: str, overrides: Mapping[str, Any]) -> tuple[str, ...]:
