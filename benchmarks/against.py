@@ -5,7 +5,7 @@ from pathlib import Path
 
 import front
 import numpy as np
-from ladder import BATCH, SAC_BATCH, area, read_table
+from ladder import BATCH, area, read_table
 from learning.curves import bold, difference, spread
 from scipy import stats
 
@@ -19,18 +19,6 @@ PLAIN = "`any-age`, `critic_norm=none`"
 """Compared with the agents whose critics have no layer normalisation either."""
 LEFT_OUT: dict[str, tuple[str, ...]] = {OWN: (), BATCH: ("any-age",), PLAIN: ("any-age", "critic_norm")}
 """The arms with tables of their own, and the words in the names of others that are left out of them."""
-VARIANTS = (
-    PLAIN,
-    "`any-age`, `encoder=mlp`",
-    "`any-age`, `forecast_learns_from=states+values`",
-    "`any-age`, `forecast_error=distance`",
-    "`bpql`, `batch_size=128`",
-    "`bpql`, `batch_size=128`, `critic_norm=layer`",
-    "`any-age`, `batch_size=128`",
-    "`any-age`, `batch_size=128`, `critic_norm=batch`, `encoder=mlp`",
-    SAC_BATCH,
-)
-"""Shown beside the arms of the first page."""
 SIMPLER = (
     OWN,
     "`any-age`, `forecast_error=distance`",
@@ -71,7 +59,7 @@ def section(files: list[Path], env: str = ENV) -> str:
 def table(results: list[Result], env: str = ENV) -> str:
     """Return a Markdown table for each delay: a row for each other agent that has ended on the preset `matched`."""
     chosen: dict[tuple[str, int | str], Result] = {}
-    for result in front.comparable(results, VARIANTS):
+    for result in front.comparable(results):
         if result.place.env == env and result.place.delay != 0:
             chosen[front.name(result), result.place.delay] = result
     pairs = []
@@ -103,7 +91,7 @@ def added_table(results: list[Result], delay: int = 25) -> str:
 
     Another agent stands with the same seeds if it has them all, else with its own five.
     """
-    here = [r for r in front.comparable(results, VARIANTS) if (r.place.env, r.place.delay) == (ENV, delay)]
+    here = [r for r in front.comparable(results) if (r.place.env, r.place.delay) == (ENV, delay)]
     chosen = {front.name(result): result for result in here if front.name(result) != PLAIN}
     own = chosen.pop(OWN)
     halves = slice(0, front.SEEDS), slice(front.SEEDS, own.runs)
@@ -134,7 +122,7 @@ def simpler(files: list[Path]) -> str:
 
 def simpler_table(results: list[Result]) -> str:
     """Return a Markdown table: a row for each of SIMPLER, a column for each of WHERE."""
-    here = front.comparable(results, SIMPLER)
+    here = front.comparable(results)
     chosen = {(front.name(result), (result.place.env, result.place.delay)): result for result in here}
     body = []
     for name in SIMPLER:

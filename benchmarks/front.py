@@ -1,4 +1,4 @@
-"""The result on the first page: what each method is worth, from the cells of `evidence-1` and `-2` that have ended."""
+"""The result on the first page: what each method is worth, from the cells that have ended."""
 
 import itertools
 from collections.abc import Collection, Iterable
@@ -12,12 +12,14 @@ from matplotlib import pyplot
 from delayrl.bench.results import Collected
 from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
-from delayrl.report.results import Result
+from delayrl.report.results import Result, Setting
+from delayrl.report.statistics import Floats
 from delayrl.report.summary import summarise
 from delayrl.report.wording import interval, normalised
 from delayrl.run.condition import Condition
 
-Case = tuple[str, int]
+Case = tuple[str, int | str]
+"""Task and delay."""
 Chosen = dict[tuple[str, Case], Result]
 """Results by arm and case."""
 CASES: tuple[Case, ...] = (
@@ -57,9 +59,17 @@ COLOURS = {
 """What the table and the picture show. Agents have the colours of reports."""
 MORE = (
     "`sac`, no delay, `critic_norm=layer`",
+    "`sac`, no delay, `batch_size=128`, `critic_norm=batch`",
+    "`any-age`, `critic_norm=none`",
+    "`any-age`, `encoder=mlp`",
+    "`any-age`, `forecast_learns_from=states+values`",
     "`any-age`, `forecast_error=distance`",
+    "`any-age`, `second_age=any`",
+    "`any-age`, `batch_size=128`",
     "`any-age`, `batch_size=128`, `encoder=mlp`",
+    "`any-age`, `batch_size=128`, `critic_norm=batch`, `encoder=mlp`",
     "`bpql`, `critic_norm=layer`",
+    "`bpql`, `batch_size=128`",
 )
 ARMS = {*COLOURS, *MORE}
 """What other pages show."""
@@ -107,10 +117,11 @@ def choose(results: list[Result]) -> Chosen:
     return chosen
 
 
-def comparable(results: list[Result], more: Collection[str] = ()) -> list[Result]:
-    """Return the results of the arms here and of `more`, at the budget of their task, those with most seeds last."""
-    alike = [r for r in results if r.condition.preset == "matched" and r.condition.steps == STEPS.get(r.place.env)]
-    return sorted((r for r in alike if ended(r) and name(r) in ARMS.union(more)), key=lambda r: r.runs)
+def comparable(results: list[Result]) -> list[Result]:
+    """Return the results of ARMS under one protocol, preset, precision and budget, those with most seeds last."""
+    alike = [r for r in results if r.place.setting == Setting("corrected", "matched") and name(r) in ARMS and ended(r)]
+    budget = [r for r in alike if r.condition.steps == STEPS.get(r.place.env)]
+    return sorted((r for r in budget if r.condition.overrides.get("precision") == "bfloat16"), key=lambda r: r.runs)
 
 
 def older(tables: list[Collected]) -> set[tuple[str, Case]]:
@@ -157,10 +168,15 @@ def cell(result: Result | None, mark: str = "") -> str:
     """Write in lines a normalised return with its mark, its interval and the raw one; nothing for what has not run."""
     if result is None:
         return ""
-    final, within = result.curves.final, interval(result.final_interval, normalised)
+    within = interval(result.final_interval, normalised)
     seeds = f"; {result.runs} seeds" if result.runs != SEEDS else ""
-    raw = spread(final) if abs(final.mean()) > 999 else f"{final.mean():.1f} ± {final.std(ddof=1):.1f}"
-    return "<br>".join([f"**{normalised(result.final.mean())}**{mark}", *([within + seeds] if within else []), raw])
+    lines = [f"**{normalised(result.final.mean())}**{mark}", *([within + seeds] if within else [])]
+    return "<br>".join([*lines, raw(result.curves.final)])
+
+
+def raw(returns: Floats) -> str:
+    """Write mean ± standard deviation, small ones with a decimal."""
+    return spread(returns) if abs(returns.mean()) > 999 else f"{returns.mean():.1f} ± {returns.std(ddof=1):.1f}"
 
 
 def draw(chosen: Chosen, out: Path) -> None:

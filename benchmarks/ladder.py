@@ -37,9 +37,9 @@ AWAY = 1_500
 """Seeds that end above this return have left the gaits on the back or creeping, at 700 to 1,480."""
 BASE, WHOLE, SAC = "`bpql`", "`any-age`", "`sac`, no delay"
 HALF = "`bpql`, `batch_size=128`, `critic_norm=layer`"
-"""BPQL with any-age's critics and half of the batch."""
+"""BPQL with any-age's critics and batches of 128."""
 TWICE = "`any-age`, `batch_size=128`, `updates=2`"
-"""As much arithmetic as WHOLE: half of the batch, two updates a step."""
+"""As much arithmetic as WHOLE: batches of 128, two updates a step."""
 BATCH = "`any-age`, `batch_size=128`, `critic_norm=batch`"
 """Any-age's best arm at a constant delay."""
 BPQL_BATCH, SAC_BATCH = BATCH.replace("any-age", "bpql"), BATCH.replace("`any-age`", SAC)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from against import VARIANTS
 from front import ARMS, COLOURS, STEPS, in_words
 from ladder import AWAY, read_table, rows_of
 from matplotlib import pyplot
@@ -65,7 +64,7 @@ def episodes(table: Collected) -> dict[Policy, Runs]:
         if condition is None or policy_of(condition) in late:
             continue
         words = CHANCE if condition.agent == CHANCE else in_words(condition, row["privileged"])
-        if words == CHANCE or words in ARMS.union(VARIANTS):
+        if words == CHANCE or words in ARMS:
             words += ", its reference without delay" if row["policy"] == "reference" else ""
             policy, seed = (condition.delay, words), row["seed"]
             if cell_of.setdefault((policy, seed), row["cell"]) != row["cell"]:

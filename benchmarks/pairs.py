@@ -2,19 +2,17 @@
 
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any
 
-from against import VARIANTS, welch
-from front import SEEDS, comparable, in_words, name, older, results_of
+from against import welch
+from front import SEEDS, Case, comparable, name, older, raw, results_of
 from ladder import area, gflop, read_table
-from learning.curves import spread
 
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
 from delayrl.report.statistics import Floats
 from delayrl.report.wording import normalised
 
-CASES: dict[str, tuple[str, int | str]] = {
+CASES: dict[str, Case] = {
     "halfcheetah-5": ("HalfCheetah-v5", 5),
     "halfcheetah-25": ("HalfCheetah-v5", 25),
     "halfcheetah-50": ("HalfCheetah-v5", 50),
@@ -28,7 +26,7 @@ CASES: dict[str, tuple[str, int | str]] = {
 """Task and delay of each table."""
 WAITING = "@wait"
 """The end of a delay whose observations are held back for the longest one."""
-HEAD = ["arm", "normalised", "at the end", "over training", "clearly above, at the end", "over training", "GFLOP"]
+HEAD = ["arm", "normalised", "at the end", "over training", "above, at the end", "above, over training", "GFLOP"]
 
 
 def sections(files: list[Path]) -> dict[str, str]:
@@ -38,24 +36,21 @@ def sections(files: list[Path]) -> dict[str, str]:
     return {key: table(results, *case, marked) for key, case in CASES.items()}
 
 
-def table(results: list[Result], env: str, delay: int | str, marked: Collection[Any] = ()) -> str:
+def table(results: list[Result], env: str, delay: int | str, marked: Collection[tuple[str, Case]] = ()) -> str:
     """Return a Markdown table of the arms that have ended at a delay, and of SAC without one, the highest first.
 
     An arm is clearly above those whose numbers it names: Welch's interval of 95 % of the difference leaves out 0. ° is
     on those `marked`.
     """
-    own = [r for r in comparable(results, VARIANTS) if r.place.env == env and plant(r) in (0, delay)]
+    own = [r for r in comparable(results) if r.place.env == env and plant(r) in (0, delay)]
     arms = {label(result): result for result in own}  # those with most seeds come last
     ranked = sorted(arms.items(), key=lambda arm: -arm[1].curves.final.mean())
     ends, areas = [result.curves.final for _, result in ranked], [area(result) for _, result in ranked]
-    body = [
-        [
-            *(f"**{place + 1}** {words}{note(result, marked)}", normalised(result.final.mean())),
-            *(spread(values[place]).replace(" ", "&nbsp;") for values in (ends, areas)),
-            *(above(place, ends), above(place, areas), gflop(result)),
-        ]
-        for place, (words, result) in enumerate(ranked)
-    ]
+    body = []
+    for place, (words, result) in enumerate(ranked):
+        cells = [f"**{place + 1}** {words}{note(result, marked)}", normalised(result.final.mean())]
+        cells += [raw(values[place]).replace(" ", "&nbsp;") for values in (ends, areas)]
+        body.append([*cells, above(place, ends), above(place, areas), gflop(result)])
     return markdown_table(HEAD, body)
 
 
@@ -64,9 +59,9 @@ def label(result: Result) -> str:
     return name(result) + (f", `{WAITING}`" if plant(result) != result.place.delay else "")
 
 
-def note(result: Result, marked: Collection[Any]) -> str:
+def note(result: Result, marked: Collection[tuple[str, Case]]) -> str:
     """Write ° if the arm has rows from before the mistake, and the number of seeds if it is another than usual."""
-    old = (in_words(result.condition, False), (result.place.env, result.place.delay)) in marked
+    old = (name(result), (result.place.env, result.place.delay)) in marked
     return " °" * old + (f" ({result.runs} seeds)" if result.runs != SEEDS else "")
 
 

@@ -12,7 +12,7 @@ from delayrl.run.cost import Cost
 REFERENCE = Anchor(np.full(2, 3900.0), np.zeros(2), "sac, no delay")
 
 
-def result(agent: str, delay: int, returns: list[list[float]], **overrides: float) -> Result:
+def result(agent: str, delay: int, returns: list[list[float]], **overrides: float | str) -> Result:
     condition = Condition(agent, "X-v0", delay, preset="matched", overrides={"precision": "bfloat16", **overrides})
     place = Place(Setting("corrected", "matched"), "X-v0", delay, agent)
     curves = Curves(np.arange(1, len(returns[0]) + 1), np.array(returns))

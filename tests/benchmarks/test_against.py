@@ -13,6 +13,7 @@ from delayrl.report.summary import summarise
 
 
 def cell(agent: str, finals: list[float], delay: int | str, **changes: Any) -> Any:
+    changes["overrides"] = {"precision": "bfloat16", **changes.get("overrides", {})}
     made = standing(agent, against.ENV, delay, len(finals), **{"steps": 100_000, "preset": "matched", **changes})
     return made, finals
 

@@ -12,7 +12,7 @@ from delayrl.report.results import Result
 def test_the_result_of_the_first_page(tmp_path: Path) -> None:
     """Each arm where it has ended, with most seeds, at the budget of its task; nothing for what has not run."""
 
-    def of(agent: str, case: front.Case, returns: list[float], steps: int = 0, **overrides: float) -> Result:
+    def of(agent: str, case: front.Case, returns: list[float], steps: int = 0, **overrides: float | str) -> Result:
         plain = result(agent, case[1], [[0.0, end] for end in returns], **overrides)
         condition = replace(plain.condition, env=case[0], steps=steps or front.STEPS[case[0]])
         return replace(plain, place=plain.place._replace(env=case[0]), condition=condition)
@@ -23,7 +23,8 @@ def test_the_result_of_the_first_page(tmp_path: Path) -> None:
     longer = of("bpql", late, [3900.0] * 9, steps=10**7)
     many = of("any-age", later, [10.0, 20.0, 30.0, 40.0, 50.0])
     sac = of("sac", (late[0], 0), [3900.0] * 5)
-    chosen = front.choose([few, many, of("any-age", later, [0.0]), sac, unfinished, longer, of("dida", late, [1.0])])
+    elsewhere = of("bpql", late, [1.0], critic_norm="layer"), of("dida", late, [1.0])
+    chosen = front.choose([few, many, of("any-age", later, [0.0]), sac, unfinished, longer, *elsewhere])
     lines = [line.split(" | ") for line in front.table(chosen).splitlines()[2:]]
     assert [line[0] for line in lines] == ["| `sac`, no delay", "| `vdpo` †", "| `any-age`"]
     assert lines[0][1:] == ["**1.00**<br>3,900 ± 0"] * 3 + ["", "", " |"]

@@ -11,9 +11,9 @@ from delayrl.report.results import Result
 ENV, STEPS = "InvertedDoublePendulum-v5", 30_000
 
 
-def of(agent: str, delay: int | str, returns: list[list[float]], **overrides: str) -> Result:
+def of(agent: str, delay: int | str, returns: list[list[float]], steps: int = STEPS, **overrides: str) -> Result:
     plain = result(agent, 5, returns, **overrides)
-    condition = replace(plain.condition, env=ENV, delay=delay, steps=STEPS)
+    condition = replace(plain.condition, env=ENV, delay=delay, steps=steps)
     return replace(plain, place=plain.place._replace(env=ENV, delay=delay), condition=condition)
 
 
@@ -36,6 +36,26 @@ def test_an_arm_names_those_that_it_is_clearly_above() -> None:
     ]
     assert [line[4:6] for line in body] == [["2–4", "2–4"], ["", "3, 4"], ["", ""], ["", ""]]
     assert body[0][1:4] == ["1.00", "3,900&nbsp;±&nbsp;1", "1,950&nbsp;±&nbsp;0"]
+
+
+def test_an_arm_counts_once_with_most_seeds() -> None:
+    """Other budgets, protocols and precisions, what has not ended and unknown arms are left out; ° marks older rows."""
+    five = [[1.0, 2.0 + seed] for seed in range(5)]
+    whole = of("bpql", 5, five)
+    official = replace(whole, place=whole.place._replace(setting=whole.place.setting._replace(protocol="official")))
+    results = [
+        whole,
+        of("bpql", 5, five[:3]),
+        official,
+        replace(whole, seeds=9),
+        of("bpql", 5, five * 2, steps=STEPS * 2),
+        of("bpql", 5, five * 2, precision="float32"),
+        of("bpql", 5, five, batch_size="64"),
+        of("any-age", 5, five, critic_norm="none"),
+    ]
+    marked = {("`bpql`", (ENV, 5))}
+    body = [line.split(" | ")[0] for line in pairs.table(results, ENV, 5, marked).splitlines()[2:]]
+    assert sorted(body) == ["| **1** `bpql` °", "| **2** `any-age`, `critic_norm=none`"]
 
 
 @pytest.mark.parametrize(

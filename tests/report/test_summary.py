@@ -154,7 +154,7 @@ def test_the_threshold_alone_may_be_of_a_longer_reference() -> None:
     assert math.isnan(result.reference_anchor.value)
     assert np.isnan([*result.final, *result.area, *result.final_interval]).all()
     (steps,) = [table for table in summary.tables if table.kind == "steps"]
-    assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].note == "2/2 seeds · reference of 500 steps"
+    assert steps.entries["delayrl/Ant-v4", 5, "vdpo"].note == "300 steps · 2/2 seeds · reference of 500 steps"
     (shown,) = [a["threshold"] for a in payload(summary, "t")["anchors"] if (a["setting"], a["total"]) == (0, 300)]
     assert shown == "30.0 ± 7.1 (sac steps=500, no delay, 500 steps)"
     equal = small()["sac"]

@@ -161,6 +161,21 @@ def test_the_papers_row_shows_its_number() -> None:
     assert "and its steps are noted" in text
 
 
+@pytest.mark.parametrize(
+    ("steps", "reference", "shown"), [(1_000, 1_000, True), (60, 1_000, True), (1_000, 2_000, False)]
+)
+def test_the_papers_steps_need_a_reference_of_its_budget(steps: int, reference: int, shown: bool) -> None:
+    """In thousands of steps. A longer reference is another threshold."""
+    env = "delayrl/Ant-v4"
+    known = [("vdpo", 5, steps, 200.0), ("sac", 0, reference, 100.0), ("random", 0, steps, 0.0)]
+    cells = [standing(agent, env, delay, steps=count * 1000) for agent, delay, count, _ in known]
+    rows = [row(c, s, c[0].condition.steps, x[3]) for c, x in zip(cells, known, strict=True) for s in c[0].seeds]
+    (table,) = [table for table in summarise(rows, cells).tables if table.kind == "steps"]
+    entry = table.entries[env, 5, "vdpo"]
+    assert entry.value == steps * 1000
+    assert (entry.published is not None) == shown
+
+
 def test_other_settings_leave_the_paper_where_it_is() -> None:
     """A variant with another preset takes no published value from an empty place of the paper's."""
     cells = [standing("vdpo", "delayrl/Ant-v4", 25), standing("bpql", "delayrl/Ant-v4", 50)]

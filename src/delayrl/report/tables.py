@@ -128,8 +128,8 @@ def _table(kind: Kind, title: str, setting: Setting, chosen: list[Result]) -> Ta
 
 def _comparable(kind: Kind, result: Result) -> bool:
     """Whether a result has the paper's preset and budget. For steps to the threshold, that of the reference counts."""
-    budgets = {result.condition.steps} | ({result.threshold_anchor.steps} if kind == "steps" else set())
-    return result.place.setting.preset == "paper" and PAPER_STEPS in budgets
+    budget = (kind == "steps" and result.threshold_anchor.steps) or result.condition.steps
+    return result.place.setting.preset == "paper" and budget == PAPER_STEPS
 
 
 def _published_key(kind: Kind, env: str, delay: int | str, agent: str, overrides: Mapping[str, Any]) -> tuple[str, ...]:
@@ -150,14 +150,14 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None, 
     if result is None or (result.progress.state == "todo" and not result.runs):
         return TableEntry(published=published)
     raw, raw_std = statistics.mean_std(result.curves.final)
-    notes = [f"{result.condition.steps:,} steps"] if several_lengths else []
+    longer = kind == "steps" and result.threshold_anchor.steps > result.condition.steps
+    notes = [f"{result.condition.steps:,} steps"] if several_lengths or longer else []
     notes += [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
     area = area_std = NAN
     if kind == "steps":
         value, std, interval = result.steps_to_threshold, NAN, result.steps_interval
         if result.seeds_at_threshold:
             notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds")
-        longer = result.threshold_anchor.steps > result.condition.steps
         if longer and result.runs and not math.isnan(result.threshold):
             notes.append(f"reference of {result.threshold_anchor.steps:,} steps")
     else:
