@@ -18,6 +18,7 @@ import lost
 import matplotlib
 import numpy as np
 import pairs
+import paper_row
 import sweeps
 
 matplotlib.use("Agg")
@@ -309,6 +310,8 @@ def main() -> None:
         insert(root / page, "result", result)
     for key, text in pairs.sections(rows).items():
         insert(root / "docs" / "benchmarks.md", key, text)
+    paper = paper_row.section(HERE / "results" / "evidence-1-paper.sqlite")
+    insert(root / "docs" / "benchmarks.md", "paper-row", paper)
     insert(root / "docs" / "benchmarks.md", "lost", lost.section(rows, images / "lost.png"))
     insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
     text = times.section(HERE / "results" / "times", images / "times.png")

@@ -53,6 +53,7 @@ def test_the_result(tmp_path: Path) -> None:
     arms, goals = figures.ladder.sections(*tables("any-age-ladder"), tmp_path / "ladder.png")
     assert section("docs/algorithms/any-age-results.md", "ladder") == arms
     assert section("docs/algorithms/any-age-trials.md", "goals") == goals
+    assert section("docs/benchmarks.md", "paper-row") == figures.paper_row.section(*tables("evidence-1-paper"))
 
 
 @pytest.mark.thorough
