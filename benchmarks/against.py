@@ -5,7 +5,7 @@ from pathlib import Path
 
 import front
 import numpy as np
-from ladder import BATCH, area, read_table
+from ladder import BATCH, area
 from learning.curves import bold, difference, spread
 from scipy import stats
 
@@ -31,7 +31,7 @@ SIMPLER = (
     "`bpql`, `batch_size=128`, `critic_norm=batch`",
     "`bpql`",
 )
-WHERE: dict[str, tuple[str, int | str]] = {
+WHERE: dict[str, front.Case] = {
     "5": (ENV, 5),
     "25": (ENV, 25),
     "50": (ENV, 50),
@@ -44,7 +44,7 @@ WHERE: dict[str, tuple[str, int | str]] = {
 
 def section(files: list[Path], env: str = ENV) -> str:
     """Return the tables of a task from the cells that have ended, with what their words mean."""
-    rows = table(front.results_of(map(read_table, files)), env)
+    rows = table(front.results_of(files), env)
     about = (
         f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where no "
         "other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are Welch's, "
@@ -83,7 +83,7 @@ def table(results: list[Result], env: str = ENV) -> str:
 
 def added(files: list[Path]) -> str:
     """Return the table of any-age's seeds in two halves: those of the plan, and those that were added later."""
-    return added_table(front.results_of(map(read_table, files)))
+    return added_table(front.results_of(files))
 
 
 def added_table(results: list[Result], delay: int = 25) -> str:
@@ -117,7 +117,7 @@ def simpler(files: list[Path]) -> str:
         "and (↓) over training alone; ↑ and (↑) are above it, by Welch's interval of 95 % for each cell, without a "
         "correction for their number. *Arithmetic* is that of a step over any-age's. An empty cell has not run."
     )
-    return f"{simpler_table(front.results_of(map(read_table, files)))}\n\n{about}"
+    return f"{simpler_table(front.results_of(files))}\n\n{about}"
 
 
 def simpler_table(results: list[Result]) -> str:
@@ -165,4 +165,4 @@ def holm(values: Sequence[float]) -> list[bool]:
 
 def ended_at(result: Result) -> str:
     """Write the returns at the end, with the number of seeds if it is another than usual."""
-    return spread(result.curves.final) + (f" ({result.runs} seeds)" if result.runs != front.SEEDS else "")
+    return spread(result.curves.final) + front.seeds(result)

@@ -1,5 +1,6 @@
 """The result on the first page: what each method is worth, from the cells that have ended."""
 
+import functools
 import itertools
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -78,7 +79,7 @@ ARMS = {*COLOURS, *MORE}
 def section(files: list[Path], pictures: Path) -> str:
     """Draw the curves as `result.png`; return the table, with what made its rows."""
     tables = [read_table(file) for file in files]
-    chosen = choose(results_of(tables))
+    chosen = choose(results_of(files))
     draw(chosen, pictures / "result.png")
     shown = [result.condition for result in chosen.values()]
     runs = itertools.chain(*map(trained_with, tables))
@@ -97,9 +98,16 @@ def section(files: list[Path], pictures: Path) -> str:
     return f"{table(chosen, older(tables))}\n\n{made}"
 
 
-def results_of(tables: Iterable[Collected]) -> list[Result]:
-    """Return the results of all tables."""
-    return [r for t in tables for r in summarise(t.rows, t.standing, t.configs).results.values()]
+def results_of(files: Iterable[Path]) -> list[Result]:
+    """Return the results of all files."""
+    return [result for file in files for result in results_in(file)]
+
+
+@functools.cache
+def results_in(file: Path) -> list[Result]:
+    """Return the results of a file, which several sections of the pages read."""
+    table = read_table(file)
+    return [*summarise(table.rows, table.standing, table.configs).results.values()]
 
 
 def ended(result: Result) -> bool:
@@ -124,7 +132,7 @@ def comparable(results: list[Result]) -> list[Result]:
     return sorted((r for r in budget if r.condition.overrides.get("precision") == "bfloat16"), key=lambda r: r.runs)
 
 
-def older(tables: list[Collected]) -> set[tuple[str, Case]]:
+def older(tables: Iterable[Collected]) -> set[tuple[str, Case]]:
     """Return the arms and cases with rows of `OLDER` commits, of agents that act under the delay alone."""
     found = set()
     for condition, privileged, versions in itertools.chain(*map(trained_with, tables)):
@@ -169,9 +177,14 @@ def cell(result: Result | None, mark: str = "") -> str:
     if result is None:
         return ""
     within = interval(result.final_interval, normalised)
-    seeds = f"; {result.runs} seeds" if result.runs != SEEDS else ""
-    lines = [f"**{normalised(result.final.mean())}**{mark}", *([within + seeds] if within else [])]
+    count = f"; {result.runs} seeds" if result.runs != SEEDS else ""
+    lines = [f"**{normalised(result.final.mean())}**{mark}", *([within + count] if within else [])]
     return "<br>".join([*lines, raw(result.curves.final)])
+
+
+def seeds(result: Result) -> str:
+    """Write the number of seeds in brackets if it is another than usual."""
+    return f" ({result.runs} seeds)" if result.runs != SEEDS else ""
 
 
 def raw(returns: Floats) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from against import welch
-from front import SEEDS, Case, comparable, name, older, raw, results_of
+from front import Case, comparable, name, older, raw, results_of, seeds
 from ladder import area, gflop, read_table
 
 from delayrl.report.markup import markdown_table
@@ -31,8 +31,7 @@ HEAD = ["arm", "normalised", "at the end", "over training", "above, at the end",
 
 def sections(files: list[Path]) -> dict[str, str]:
     """Return the table of each case."""
-    tables = [read_table(file) for file in files]
-    results, marked = results_of(tables), older(tables)
+    results, marked = results_of(files), older(map(read_table, files))
     return {key: table(results, *case, marked) for key, case in CASES.items()}
 
 
@@ -62,7 +61,7 @@ def label(result: Result) -> str:
 def note(result: Result, marked: Collection[tuple[str, Case]]) -> str:
     """Write ° if the arm has rows from before the mistake, and the number of seeds if it is another than usual."""
     old = (name(result), (result.place.env, result.place.delay)) in marked
-    return " °" * old + (f" ({result.runs} seeds)" if result.runs != SEEDS else "")
+    return " °" * old + seeds(result)
 
 
 def plant(result: Result) -> int | str:

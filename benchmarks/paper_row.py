@@ -15,8 +15,7 @@ PROTOCOLS = ("corrected", "official")
 
 def section(file: Path) -> str:
     """Return the table, with where its rows are."""
-    collected = read_table(file)
-    return f"{table(results_of([collected]))}\n\n{rows_of([file], [collected])}"
+    return f"{table(results_of([file]))}\n\n{rows_of([file], [read_table(file)])}"
 
 
 def table(results: list[Result]) -> str:
@@ -43,8 +42,9 @@ def table(results: list[Result]) -> str:
 
 def then(result: Result | None, step: int) -> str:
     """Write the returns of the evaluation at a step; empty without one."""
-    known = result is not None and step in result.curves.steps
-    return written(result, list(result.curves.steps).index(step)) if result and known else ""
+    if result is None or step not in result.curves.steps:
+        return ""
+    return written(result, list(result.curves.steps).index(step))
 
 
 def last(result: Result) -> str:

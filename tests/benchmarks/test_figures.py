@@ -64,7 +64,7 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/algorithms/any-age-results.md", "against-poles") == poles
     assert section("docs/algorithms/any-age-results.md", "added-seeds") == figures.against.added(rows)
     assert section("docs/algorithms/any-age-results.md", "simpler") == figures.against.simpler(rows)
-    ended = figures.front.comparable(figures.front.results_of(map(figures.front.read_table, rows)))
+    ended = figures.front.comparable(figures.front.results_of(rows))
     cases = {(result.place.env, figures.pairs.plant(result)) for result in ended}
     assert {case for case in cases if case[1] != 0} == {*figures.pairs.CASES.values()}  # none is left out
     for key, text in figures.pairs.sections(rows).items():
