@@ -97,6 +97,13 @@ def anchored(cells: dict[str, Standing], **curves: list[list[float]]) -> list[di
     return [r for name, runs in curves.items() for seed, c in enumerate(runs) for r in curve(cells[name], seed, c)]
 
 
+def longer_reference() -> tuple[list[Standing], list[dict[str, Any]]]:
+    """Cells and rows of an agent that ends after 300 steps, where delay-free SAC has 500, and a random policy."""
+    cells = small() | {"sac": standing("sac", "delayrl/Ant-v4", 0, 2, steps=500)}
+    sac = [[20.0, 40, 60, 80, 100], [0.0, 20, 40, 60, 120]]
+    return [*cells.values()], anchored(cells, vdpo=[[0.0, 10, 20], [0.0, 20, 40]], sac=sac)
+
+
 def two_lengths() -> tuple[list[Standing], list[dict[str, Any]]]:
     """Cells and rows of agents that end after 400 and after 800 steps, each with its delay-free SAC."""
     some = (("vdpo", 5, 400), ("vdpo", 25, 400), ("bpql", 5, 800), ("sac", 0, 400), ("sac", 0, 800), ("random", 0, 400))

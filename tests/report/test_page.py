@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic import EVIL, NASTY, anchored, full_grid, nasty, rows, small, standing, two_lengths
+from synthetic import EVIL, NASTY, anchored, full_grid, longer_reference, nasty, rows, small, standing, two_lengths
 
 from delayrl.report.page import page, payload
 from delayrl.report.report import report
@@ -153,6 +153,20 @@ def test_page_rounds_once(opened: Any) -> None:
     view = opened(summarise(every, [*cells.values()]))
     assert "raw 3,406 ± 0" in view.locator("#normalised-0").inner_text()
     assert "3,406 ± 0" in view.locator("#all").inner_text()
+
+
+def test_page_draws_the_curve_of_a_longer_reference_as_far_as_the_learners(opened: Any) -> None:
+    cells, every = longer_reference()
+    view = opened(summarise(every, cells))
+    lines = view.locator("#curves polyline.curve").all()
+    xs = [[point.split(",")[0] for point in line.get_attribute("points").split()] for line in lines]
+    assert len(xs) == 2
+    assert xs[0] == xs[1]
+    assert len(xs[0]) == 3
+    view.locator("#curves figure svg").hover()
+    assert "delay-free SAC, the first of 500 steps" in view.locator("#tip").inner_text()
+    view.locator("#curves button", has_text="normalised").click()
+    assert not view.locator("#curves polyline.curve").count()  # it is no anchor
 
 
 @pytest.mark.thorough

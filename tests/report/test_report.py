@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
-from synthetic import rows, small, standing, two_lengths
+from synthetic import longer_reference, rows, small, standing, two_lengths
 
 from delayrl.errors import DelayRLError
 from delayrl.report import figures
@@ -78,6 +78,14 @@ def test_pictures_draw_the_delay_free_line_of_each_length(tmp_path: Path, drawn:
     assert marks == [["400 steps", "800 steps"], [], ["400 steps", "800 steps"], []]
     lines = {round(line.get_ydata()[0]) for line in drawn[0].axes[0].lines if line.get_label() == figures.SAC[0]}
     assert len(lines) == 2
+
+
+def test_pictures_draw_the_curve_of_a_longer_reference_as_far_as_the_learners(tmp_path: Path, drawn: list[Any]) -> None:
+    cells, every = longer_reference()
+    figures.draw(summarise(every, cells), tmp_path)
+    (line,) = [line for line in drawn[0].axes[0].lines if line.get_label() == figures.SAC[0]]
+    assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([100, 200, 300], [10, 30, 50])
+    assert figures.SAC[0] in [words(text) for text in drawn[0].legends[0].get_texts()]
 
 
 def test_command(tmp_path: Path) -> None:

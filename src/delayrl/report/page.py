@@ -127,7 +127,12 @@ def _anchors(r: Result, names: Names) -> dict[str, Any]:
     values = {
         name: {"value": _rounded(a.value), "text": wording.anchor(a), "source": a.source} for name, a in anchors.items()
     }
-    return {"setting": setting, "task": task, "total": r.condition.steps, "threshold": wording.threshold(r), **values}
+    known = {"setting": setting, "task": task, "total": r.condition.steps, "threshold": wording.threshold(r), **values}
+    longer = r.longer_reference
+    if not longer.steps:
+        return known
+    steps, mean = longer.curves.steps.tolist(), _rounded(longer.curves.mean, 5)
+    return known | {"longer": {"total": longer.steps, "points": list(zip(steps, mean, strict=True))}}
 
 
 def _table(table: Table, names: Names) -> dict[str, Any]:

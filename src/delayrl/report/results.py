@@ -39,6 +39,9 @@ class Curves(NamedTuple):
         return self.returns[:, -1] if self.steps.size else np.zeros(0)
 
 
+NO_CURVES = Curves(np.zeros(0, np.int64), np.zeros((0, 0)))
+
+
 class Anchor(NamedTuple):
     """What others are measured by; without any runs, there is no such anchor."""
 
@@ -46,6 +49,7 @@ class Anchor(NamedTuple):
     smoothed: Floats  # the same, of the reference's smoothed curves: the threshold that learners are to reach
     source: str = ""  # its agent
     steps: int = 0  # for which it has trained
+    curves: Curves = NO_CURVES  # of the reference
 
     @property
     def value(self) -> float:
@@ -161,6 +165,11 @@ class Result:
         reference, random = self.threshold_anchor, self.random_anchor.value
         smoothed = statistics.mean_std(reference.smoothed)[0] if reference.value > random else NAN
         return smoothed if smoothed > random else NAN
+
+    @property
+    def longer_reference(self) -> Anchor:
+        """The threshold's, if it has trained for longer than this; else none."""
+        return self.threshold_anchor if self.threshold_anchor.steps > self.condition.steps else NO_ANCHOR
 
     @property
     def missed(self) -> bool:
@@ -303,7 +312,8 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
 
 
 def _reference(result: Result) -> Anchor:
-    return Anchor(result.curves.final, result.smoothed[:, -1], result.as_reference, result.condition.steps)
+    smoothed = result.smoothed[:, -1]
+    return Anchor(result.curves.final, smoothed, result.as_reference, result.condition.steps, result.curves)
 
 
 def _fewest_overrides(result: Result) -> tuple[Any, ...]:

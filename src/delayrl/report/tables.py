@@ -150,7 +150,7 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None, 
     if result is None or (result.progress.state == "todo" and not result.runs):
         return TableEntry(published=published)
     raw, raw_std = statistics.mean_std(result.curves.final)
-    longer = kind == "steps" and result.threshold_anchor.steps > result.condition.steps
+    longer = kind == "steps" and result.longer_reference.steps
     notes = [f"{result.condition.steps:,} steps"] if several_lengths or longer else []
     notes += [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
     area = area_std = NAN
@@ -159,7 +159,7 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None, 
         if result.seeds_at_threshold:
             notes.append(f"{result.seeds_at_threshold}/{result.runs} seeds")
         if longer and result.runs and not math.isnan(result.threshold):
-            notes.append(f"reference of {result.threshold_anchor.steps:,} steps")
+            notes.append(f"reference of {longer:,} steps")
     else:
         value, std = statistics.mean_std(result.final)
         interval, (area, area_std) = result.final_interval, statistics.mean_std(result.area)
