@@ -143,18 +143,19 @@ def _curves(results: list[Result], delay: int | str, looks: dict[str, Look], pat
     """Mean over the seeds and standard deviation, a panel for each task."""
     figure, panels = _task_panels(results)
     for task, axes in panels.items():
-        mine, last = [r for r in results if r.place.env == task], 0
+        mine = [r for r in results if r.place.env == task]
         for result in mine:
             steps, mean, style = result.curves.steps, result.curves.mean, _line(looks[result.place.label])
             axes.plot(steps, mean, **style)
-            last = max(last, *steps.tolist())
             if result.runs > 1:
                 std = result.curves.returns.std(0, ddof=1)
                 axes.fill_between(steps, mean - std, mean + std, color=style["color"], alpha=0.13, lw=0)
         _anchor_lines(axes, mine)
+        last = max(r.curves.steps[-1] for r in mine)
         longer = {r.longer_reference.steps: r.longer_reference.curves for r in mine if r.longer_reference.steps}
         for curves in longer.values():
-            axes.plot(*(line[curves.steps <= last] for line in (curves.steps, curves.mean)), **_line(SAC))
+            shown = curves.steps <= last
+            axes.plot(curves.steps[shown], curves.mean[shown], **_line(SAC))
         axes.set_title(_drawn(f"{task}, Δ = {delay}", TITLE), fontsize=10)
         axes.set(xlabel="environment steps", ylabel="return")
         axes.ticklabel_format(axis="both", style="sci", scilimits=(-3, 4))
