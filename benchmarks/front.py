@@ -92,7 +92,7 @@ def section(files: list[Path], pictures: Path) -> str:
         "end ± the standard deviation over seeds; a seed's return is a mean of ten episodes. † acts on the true state "
         "while it trains. ° has rows from before a mistake was fixed, of which more below. VDPO has `--tokens 1280`. "
         "`critic_norm=batch` and `critic_norm=layer` are batch and layer normalisation in the critics; any-age has the "
-        "latter where no other is named, and VDPO, lifting and A-SAC have none. "
+        "latter where no other is named, the others none. "
         f"{made_on(used)} {rows_of(files, tables)}"
     )
     return f"{table(chosen, older(tables))}\n\n{made}"
