@@ -91,8 +91,8 @@ def section(files: list[Path], pictures: Path) -> str:
         "number is given. Below each normalised return stands its 95 % interval, then the raw return at the "
         "end ± the standard deviation over seeds; a seed's return is a mean of ten episodes. † acts on the true state "
         "while it trains. ° has rows from before a mistake was fixed, of which more below. VDPO has `--tokens 1280`. "
-        "`critic_norm=batch` and `critic_norm=layer` are batch and layer normalisation in the critics; any-age has the "
-        "latter where no other is named, the others none. "
+        "`critic_norm=batch` and `critic_norm=layer` are batch and layer normalisation in the critics; where none is "
+        "named, any-age has the latter and the others none. "
         f"{made_on(used)} {rows_of(files, tables)}"
     )
     return f"{table(chosen, older(tables))}\n\n{made}"

@@ -98,10 +98,14 @@ def anchored(cells: dict[str, Standing], **curves: list[list[float]]) -> list[di
 
 
 def longer_reference() -> tuple[list[Standing], list[dict[str, Any]]]:
-    """Cells and rows of an agent that ends after 300 steps, where delay-free SAC has 500, and a random policy."""
-    cells = small() | {"sac": standing("sac", "delayrl/Ant-v4", 0, 2, steps=500)}
-    sac = [[20.0, 40, 60, 80, 100], [0.0, 20, 40, 60, 120]]
-    return [*cells.values()], anchored(cells, vdpo=[[0.0, 10, 20], [0.0, 20, 40]], sac=sac)
+    """Cells and rows of agents that end after 300 and 400 steps, where delay-free SAC has 300 and 500."""
+    cells = small() | {
+        "bpql": standing("bpql", "delayrl/Ant-v4", 5, 2, steps=400),
+        "longer": standing("sac", "delayrl/Ant-v4", 0, 2, id="longer", steps=500),
+    }
+    longer = [[20.0, 40, 60, 80, 100], [0.0, 20, 40, 60, 120]]
+    vdpo, bpql = [[0.0, 10, 20], [0.0, 20, 40]], [[0.0, 10, 20, 30], [0.0, 20, 40, 60]]
+    return [*cells.values()], anchored(cells, vdpo=vdpo, bpql=bpql, longer=longer)
 
 
 def two_lengths() -> tuple[list[Standing], list[dict[str, Any]]]:

@@ -83,9 +83,11 @@ def test_pictures_draw_the_delay_free_line_of_each_length(tmp_path: Path, drawn:
 def test_pictures_draw_the_curve_of_a_longer_reference_as_far_as_the_learners(tmp_path: Path, drawn: list[Any]) -> None:
     cells, every = longer_reference()
     figures.draw(summarise(every, cells), tmp_path)
-    (line,) = [line for line in drawn[0].axes[0].lines if line.get_label() == figures.SAC[0]]
-    assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([100, 200, 300], [10, 30, 50])
-    assert figures.SAC[0] in [words(text) for text in drawn[0].legends[0].get_texts()]
+    name = f"{figures.SAC[0]} (500 steps)"
+    (line,) = [line for line in drawn[0].axes[0].lines if line.get_label() == name]
+    assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([100, 200, 300, 400], [10, 30, 50, 70])
+    assert {name, figures.SAC[0]} <= {words(text) for text in drawn[0].legends[0].get_texts()}  # and the line of 300
+    assert len(drawn[0].axes[0].collections) == 3  # its band too
 
 
 def test_command(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from delayrl.report.results import Result, Setting, agent_order, delay_order
+from delayrl.report.results import Curves, Result, Setting, agent_order, delay_order
 from delayrl.report.statistics import mean_std
 from delayrl.report.summary import THRESHOLDS, Aggregate, Summary
 from delayrl.run.disk import write_figure
@@ -145,21 +145,26 @@ def _curves(results: list[Result], delay: int | str, looks: dict[str, Look], pat
     for task, axes in panels.items():
         mine = [r for r in results if r.place.env == task]
         for result in mine:
-            steps, mean, style = result.curves.steps, result.curves.mean, _line(looks[result.place.label])
-            axes.plot(steps, mean, **style)
-            if result.runs > 1:
-                std = result.curves.returns.std(0, ddof=1)
-                axes.fill_between(steps, mean - std, mean + std, color=style["color"], alpha=0.13, lw=0)
+            _curve(axes, result.curves, _line(looks[result.place.label]))
         _anchor_lines(axes, mine)
         last = max(r.curves.steps[-1] for r in mine)
         longer = {r.longer_reference.steps: r.longer_reference.curves for r in mine if r.longer_reference.steps}
-        for curves in longer.values():
+        for trained, curves in longer.items():
             shown = curves.steps <= last
-            axes.plot(curves.steps[shown], curves.mean[shown], **_line(SAC))
+            look = _line(SAC) | {"label": f"{SAC[0]} ({trained:,} steps)"}
+            _curve(axes, Curves(curves.steps[shown], curves.returns[:, shown]), look)
         axes.set_title(_drawn(f"{task}, Δ = {delay}", TITLE), fontsize=10)
         axes.set(xlabel="environment steps", ylabel="return")
         axes.ticklabel_format(axis="both", style="sci", scilimits=(-3, 4))
     _save(figure, path)
+
+
+def _curve(axes: Any, curves: Curves, style: dict[str, Any]) -> None:
+    steps, mean = curves.steps, curves.mean
+    axes.plot(steps, mean, **style)
+    if len(curves.returns) > 1:
+        std = curves.returns.std(0, ddof=1)
+        axes.fill_between(steps, mean - std, mean + std, color=style["color"], alpha=0.13, lw=0)
 
 
 def _against_delay(results: list[Result], looks: dict[str, Look], path: Path) -> None:

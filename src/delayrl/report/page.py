@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
@@ -58,7 +59,7 @@ def payload(summary: Summary, title: str, description: str = "") -> dict[str, An
         "tasks": tasks,
         "delays": delays,
         "agents": [{"label": label, "name": summary.name(label), "style": styles[label]} for label in agents],
-        "results": [_result(r, names) for r in results],
+        "results": [_result(r, results, names) for r in results],
         "anchors": [_anchors(r, names) for r in anchored.values()],
         "tables": [_table(t, names) for t in summary.tables],
         "costs": [wording.costs(summary, s) for s in settings],
@@ -87,7 +88,7 @@ def _rounded(value: Any, digits: int = 12) -> Any:
     return [_rounded(x, digits) for x in value] if isinstance(value, list | tuple) else value
 
 
-def _result(r: Result, names: Names) -> dict[str, Any]:
+def _result(r: Result, results: Sequence[Result], names: Names) -> dict[str, Any]:
     curves = r.curves
     return {
         "setting": names["settings"].index(r.place.setting),
@@ -110,6 +111,7 @@ def _result(r: Result, names: Names) -> dict[str, Any]:
         "missed": r.missed,
         "reachedInterval": wording.interval(r.steps_interval, wording.steps),
         "anchor": names["anchors"].index(_anchor_key(r)),
+        "longer": next((i for i, o in enumerate(results) if o.curves is r.longer_reference.curves), None),
         "steps": curves.steps.tolist(),
         "mean": _rounded(curves.mean, 5) if r.runs else [],
         "std": _rounded(curves.returns.std(0, ddof=1), 5) if r.runs > 1 else [],
@@ -127,12 +129,7 @@ def _anchors(r: Result, names: Names) -> dict[str, Any]:
     values = {
         name: {"value": _rounded(a.value), "text": wording.anchor(a), "source": a.source} for name, a in anchors.items()
     }
-    known = {"setting": setting, "task": task, "total": r.condition.steps, "threshold": wording.threshold(r), **values}
-    longer = r.longer_reference
-    if not longer.steps:
-        return known
-    steps, mean = longer.curves.steps.tolist(), _rounded(longer.curves.mean, 5)
-    return known | {"longer": {"total": longer.steps, "points": list(zip(steps, mean, strict=True))}}
+    return {"setting": setting, "task": task, "total": r.condition.steps, "threshold": wording.threshold(r), **values}
 
 
 def _table(table: Table, names: Names) -> dict[str, Any]:

@@ -150,7 +150,7 @@ def _entry(kind: Kind, result: Result | None, published: PublishedValue | None, 
     if result is None or (result.progress.state == "todo" and not result.runs):
         return TableEntry(published=published)
     raw, raw_std = statistics.mean_std(result.curves.final)
-    longer = kind == "steps" and result.longer_reference.steps
+    longer = result.longer_reference.steps if kind == "steps" else 0
     notes = [f"{result.condition.steps:,} steps"] if several_lengths or longer else []
     notes += [] if result.runs in (0, result.seeds) else [f"{result.runs} of {result.seeds} seeds"]
     area = area_std = NAN
