@@ -16,7 +16,7 @@ import delayrl
 from delayrl.bench import folders
 from delayrl.bench.grid import Grid, load_grid
 from delayrl.bench.results import cells_done, collect, configs_of, read_table, rows_of
-from delayrl.bench.status import progress, standing
+from delayrl.bench.status import progress, seconds_left, standing
 from delayrl.bench.worker import Outcome, work
 from delayrl.cli.main import main
 from delayrl.run import provenance
@@ -381,6 +381,26 @@ def test_damaged_lines_of_journal_and_metrics(finished, tmp_path: Path, line: by
     assert progress(grid.cells[0], tmp_path / "runs") == Progress("done", 60)
     with folders.hold_cell(home):
         assert progress(grid.cells[0], tmp_path / "runs")[:2] == ("running", 60)
+
+
+def test_random_steps_say_nothing_of_the_time_left(finished, tmp_path: Path) -> None:
+    """They are fast: a cell has a speed from its first update on, and another when it is done."""
+    grid, runs = finished
+    done, begun = grid.cells
+    shutil.copytree(runs, tmp_path / "runs")
+    home = tmp_path / "runs" / begun.folder
+    folders.prepare(home, begun)
+    lines = [{"step": 20, "steps_per_second": 1000.0}, {"step": 30, "steps_per_second": 9.0}]
+    lines[1]["learning_steps_per_second"] = 5.0
+    with folders.hold_cell(home):
+        for metrics, speed, left in zip(lines, (None, 5.0), (None, 6.0), strict=True):
+            (home / "seed0").mkdir(exist_ok=True)
+            (home / "seed0" / "metrics.jsonl").write_text(json.dumps(metrics) + "\n")
+            now = progress(begun, tmp_path / "runs")
+            assert now[:3] == ("running", metrics["step"], speed)
+            assert seconds_left([(begun, now)], 1) == left
+    (tmp_path / "runs" / done.folder / "seed0" / "metrics.jsonl").write_text(json.dumps(lines[1]) + "\n")
+    assert progress(done, tmp_path / "runs").speed == 9
 
 
 def test_worker(finished, tmp_path: Path) -> None:

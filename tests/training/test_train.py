@@ -41,6 +41,17 @@ def test_rows(vdpo: Run) -> None:
     assert set(vdpo.config["versions"]) >= {"jax", "mujoco", "gymnasium", "numpy", "device"}
 
 
+def test_speed_of_learning(tmp_path: Path, monkeypatch) -> None:
+    """Logged from the first update on, beside the speed of the whole run."""
+    monkeypatch.setattr("delayrl.training.loop.METRICS_EVERY", 20)
+    run = train("sac", tmp_path / "run", delay=0, steps=80, random_steps=50, evaluate_every=50)
+    rows = run.metrics()
+    assert [row["step"] for row in rows] == [20, 40, 60, 80]
+    assert all(row["steps_per_second"] > 0 for row in rows)
+    assert ["learning_steps_per_second" in row for row in rows] == [False, False, True, True]
+    assert ["critic_loss" in row for row in rows] == [False, False, True, True]
+
+
 def test_same_seed_same_run(vdpo: Run, tmp_path: Path) -> None:
     again = train("vdpo", tmp_path / "again")
     assert again.rows() == vdpo.rows()

@@ -18,7 +18,8 @@ def progress(cell: Cell, runs: Path) -> Progress:
     step, complete = folders.stored(folder, cell.seeds)
     holder, events = folders.holder(folder), folders.journal(folder)
     metrics = folders.newest_metrics(folders.seed_paths(folder, cell.seeds)[0])
-    speed = metrics.get("steps_per_second")
+    # random steps are fast, and say nothing of the steps that are left
+    speed = metrics.get("steps_per_second" if complete else "learning_steps_per_second")
     if holder is not None:
         return Progress("running", max(step, int(metrics.get("step", 0))), speed, holder)
     if complete:
@@ -42,8 +43,8 @@ def standing(cells: Sequence[Cell], runs: Path) -> list[tuple[Cell, Progress]]:
 def seconds_left(standing: Standing, workers: int) -> float | None:
     """Estimate the time left from the speeds measured so far, or return None if there are none yet.
 
-    A cell that has not begun is taken to be as fast as the median of the cells most like it that have: the same agent,
-    task and delay, else the same agent and task, else the same agent, else all.
+    A cell that has not learned yet is taken to be as fast as the median of the cells most like it that have: the same
+    agent, task and delay, else the same agent and task, else the same agent, else all.
     """
     measured = [(cell, p.speed) for cell, p in standing if p.speed]
     unfinished = [(cell, p) for cell, p in standing if p.state not in ("done", "failed")]

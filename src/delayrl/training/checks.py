@@ -28,7 +28,7 @@ from delayrl.training.tracking import SERVICES
 from delayrl.wrappers import Delayed
 from delayrl.wrappers.layers import check_limit, name_of
 
-METRICS = ("step", "steps_per_second")
+METRICS = ("step", "steps_per_second", "learning_steps_per_second")
 """What a run's lines of metrics hold anyway."""
 
 

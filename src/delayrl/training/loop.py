@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -31,6 +31,17 @@ from delayrl.training.resume import save
 from delayrl.training.state import Group, TrainState
 
 METRICS_EVERY = 1000
+
+
+class Since(NamedTuple):
+    """A moment in a run, to measure speed from."""
+
+    seconds: float
+    step: int
+
+    def speed(self, step: int) -> float:
+        """Return the environment steps per second from then until now, at `step`."""
+        return (step - self.step) / (time.perf_counter() - self.seconds)
 
 
 def run(group: Group, state: TrainState, note: Callable[[str], None], stopped: Callable[[], bool]) -> None:
@@ -60,8 +71,8 @@ class Loop:
         self.group, self.state, self._recorder = group, state, recorder
         self._metrics: Metrics = {}
         self._ended: list[list[dict[str, Any]]] = [[] for _ in state.actors]  # episodes of each seed, not yet written
-        self._learning = False
-        self._began, self._began_step = time.perf_counter(), state.step
+        self._began = Since(time.perf_counter(), state.step)
+        self._learning: Since | None = None
 
     def train(self, stopped: Callable[[], bool], bar: Any) -> None:
         """Train until the last step, until `stopped()`, or until an evaluation after which the callback is true."""
@@ -74,8 +85,10 @@ class Loop:
             self.step()
             bar.update(1)
             if state.step % METRICS_EVERY == 0:
-                speed = (state.step - self._began_step) / (time.perf_counter() - self._began)
-                self._recorder.log(state.step, self._metrics, speed)
+                speeds = {"steps_per_second": self._began.speed(state.step)}
+                if self._learning:
+                    speeds["learning_steps_per_second"] = self._learning.speed(state.step)
+                self._recorder.log(state.step, self._metrics, speeds)
             if state.step % schedule.evaluate_every == 0 or state.step == schedule.steps:
                 self.choose()  # before learning, as at every other step
                 self.learn()  # what is evaluated has learned from every step before
@@ -121,7 +134,7 @@ class Loop:
         state.pending = []
         self._metrics |= metrics
         if due and not self._learning:
-            self._learning = True
+            self._learning = Since(time.perf_counter(), state.step)  # compiled by now
             if not self._can_learn():  # the first block's own steps count too
                 task = group.setup.condition.env
                 raise DelayRLError(f"no episode of {task} is long enough to learn from under this protocol")

@@ -100,8 +100,8 @@ class Recorder:
                 run.append("episodes", own)
                 own.clear()
 
-    def log(self, step: int, metrics: Metrics, steps_per_second: float) -> None:
-        """Write the newest metrics of each seed. Raises DelayRLError for one that is not finite."""
+    def log(self, step: int, metrics: Metrics, speeds: dict[str, float]) -> None:
+        """Write speeds and the newest metrics of each seed. Raises DelayRLError for a metric that is not finite."""
         values = jax.device_get(metrics)
         for i, (run, tracker) in enumerate(zip(self._group.folders, self._trackers, strict=True)):
             own = {name: float(x[i]) for name, x in values.items()}
@@ -109,5 +109,5 @@ class Recorder:
                 if not np.isfinite(x):
                     seed = self._group.seeds[i]
                     raise DelayRLError(f"{name} is {x} at step {step} of seed {seed}: training diverged; {KEPT}")
-            run.append("metrics", [{"step": step, "steps_per_second": round(steps_per_second, 2), **own}])
-            tracker.write(step, own | {"steps_per_second": steps_per_second})
+            run.append("metrics", [{"step": step, **{name: round(x, 2) for name, x in speeds.items()}, **own}])
+            tracker.write(step, own | speeds)
