@@ -21,7 +21,8 @@ def section(file: Path) -> str:
 def table(results: list[Result]) -> str:
     """Return a Markdown table: each agent's returns at the step at which the paper's reached that of SAC, and after it.
 
-    Beside them stands what SAC without a delay returns at that step. An agent is there once all its seeds have ended.
+    Beside them stands what SAC without a delay returns at that step. A delayed agent is there once all its seeds have
+    ended, SAC once one has.
     """
     at = {(r.condition.agent, r.place.setting.protocol): r for r in results if r.runs}
     body = []

@@ -214,7 +214,7 @@ def result(run: Path) -> dict[str, Any]:
     return {
         "config": {key: value for key, value in config.items() if key != "versions"},
         "rows": (run / "rows.jsonl").read_text(),
-        "metrics": [{k: v for k, v in line.items() if k != "steps_per_second"} for line in metrics],
+        "metrics": [{k: v for k, v in line.items() if not k.endswith("steps_per_second")} for line in metrics],
         "weights": {name: digest(f"{x.dtype}{x.shape}".encode() + x.tobytes()) for name, x in sorted(arrays.items())},
     }
 

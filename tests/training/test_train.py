@@ -42,7 +42,7 @@ def test_rows(vdpo: Run) -> None:
 
 
 def test_speed_of_learning(tmp_path: Path, monkeypatch) -> None:
-    """Logged from the first update on, beside the speed of the whole run."""
+    """Logged from the first update on, beside the speed of the whole run; of an agent that never learns, always."""
     monkeypatch.setattr("delayrl.training.loop.METRICS_EVERY", 20)
     run = train("sac", tmp_path / "run", delay=0, steps=80, random_steps=50, evaluate_every=50)
     rows = run.metrics()
@@ -50,6 +50,8 @@ def test_speed_of_learning(tmp_path: Path, monkeypatch) -> None:
     assert all(row["steps_per_second"] > 0 for row in rows)
     assert ["learning_steps_per_second" in row for row in rows] == [False, False, True, True]
     assert ["critic_loss" in row for row in rows] == [False, False, True, True]
+    never = train("random", tmp_path / "random", steps=40, evaluate_every=40).metrics()
+    assert ["learning_steps_per_second" in row for row in never] == [True, True]
 
 
 def test_same_seed_same_run(vdpo: Run, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ def progress(cell: Cell, runs: Path) -> Progress:
     step, complete = folders.stored(folder, cell.seeds)
     holder, events = folders.holder(folder), folders.journal(folder)
     metrics = folders.newest_metrics(folders.seed_paths(folder, cell.seeds)[0])
-    # random steps are fast, and say nothing of the steps that are left
+    # random steps are fast: they count in the time of a finished cell, not in what is left of another
     speed = metrics.get("steps_per_second" if complete else "learning_steps_per_second")
     if holder is not None:
         return Progress("running", max(step, int(metrics.get("step", 0))), speed, holder)

@@ -115,8 +115,9 @@ def caption(table: Table) -> str:
 
 CELLS_CAPTION = (
     "Tables above leave out rows and columns without a number; here are all. Returns after the last step. Hours: of "
-    "one worker, on a CPU one core, for all seeds together, at the speed since its last start, beside whatever else "
-    "the machine did. Steps to Ret_df: to the threshold in the table of anchors."
+    "one worker, on a CPU one core, for all seeds together, at the speed since its last start (of an unfinished cell, "
+    "since its first update after it), beside whatever else the machine did. Steps to Ret_df: to the threshold in the "
+    "table of anchors."
 )
 AGGREGATE_CAPTION = (
     "Over all runs of all tasks; 95 % interval. Agents that lack a task on which another has ended at this delay are "

@@ -33,8 +33,8 @@ from delayrl.training.state import Group, TrainState
 METRICS_EVERY = 1000
 
 
-class Since(NamedTuple):
-    """A moment in a run, to measure speed from."""
+class Moment(NamedTuple):
+    """A time and a step of a run, to measure speed from."""
 
     seconds: float
     step: int
@@ -71,8 +71,8 @@ class Loop:
         self.group, self.state, self._recorder = group, state, recorder
         self._metrics: Metrics = {}
         self._ended: list[list[dict[str, Any]]] = [[] for _ in state.actors]  # episodes of each seed, not yet written
-        self._began = Since(time.perf_counter(), state.step)
-        self._learning: Since | None = None
+        self._began = Moment(time.perf_counter(), state.step)
+        self._learning: Moment | None = None if group.program.phases else self._began  # an agent that never learns
 
     def train(self, stopped: Callable[[], bool], bar: Any) -> None:
         """Train until the last step, until `stopped()`, or until an evaluation after which the callback is true."""
@@ -134,7 +134,7 @@ class Loop:
         state.pending = []
         self._metrics |= metrics
         if due and not self._learning:
-            self._learning = Since(time.perf_counter(), state.step)  # compiled by now
+            self._learning = Moment(time.perf_counter(), state.step)  # after the call, which compiles what is due
             if not self._can_learn():  # the first block's own steps count too
                 task = group.setup.condition.env
                 raise DelayRLError(f"no episode of {task} is long enough to learn from under this protocol")
