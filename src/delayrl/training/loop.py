@@ -5,10 +5,9 @@ chosen before the update that follows a step: the device learns while the enviro
 """
 
 import sys
-import time
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -31,17 +30,6 @@ from delayrl.training.resume import save
 from delayrl.training.state import Group, TrainState
 
 METRICS_EVERY = 1000
-
-
-class Moment(NamedTuple):
-    """A time and a step of a run, to measure speed from."""
-
-    seconds: float
-    step: int
-
-    def speed(self, step: int) -> float:
-        """Return the environment steps per second from then until now, at `step`."""
-        return (step - self.step) / (time.perf_counter() - self.seconds)
 
 
 def run(group: Group, state: TrainState, note: Callable[[str], None], stopped: Callable[[], bool]) -> None:
@@ -71,8 +59,7 @@ class Loop:
         self.group, self.state, self._recorder = group, state, recorder
         self._metrics: Metrics = {}
         self._ended: list[list[dict[str, Any]]] = [[] for _ in state.actors]  # episodes of each seed, not yet written
-        self._began = Moment(time.perf_counter(), state.step)
-        self._learning: Moment | None = None if group.program.phases else self._began  # an agent that never learns
+        self._learning = False
 
     def train(self, stopped: Callable[[], bool], bar: Any) -> None:
         """Train until the last step, until `stopped()`, or until an evaluation after which the callback is true."""
@@ -85,10 +72,7 @@ class Loop:
             self.step()
             bar.update(1)
             if state.step % METRICS_EVERY == 0:
-                speeds = {"steps_per_second": self._began.speed(state.step)}
-                if self._learning:
-                    speeds["learning_steps_per_second"] = self._learning.speed(state.step)
-                self._recorder.log(state.step, self._metrics, speeds)
+                self._recorder.log(state.step, self._metrics)
             if state.step % schedule.evaluate_every == 0 or state.step == schedule.steps:
                 self.choose()  # before learning, as at every other step
                 self.learn()  # what is evaluated has learned from every step before
@@ -134,7 +118,7 @@ class Loop:
         state.pending = []
         self._metrics |= metrics
         if due and not self._learning:
-            self._learning = Moment(time.perf_counter(), state.step)  # after the call, which compiles what is due
+            self._learning = True
             if not self._can_learn():  # the first block's own steps count too
                 task = group.setup.condition.env
                 raise DelayRLError(f"no episode of {task} is long enough to learn from under this protocol")

@@ -1,7 +1,8 @@
 """Evaluation and metrics of a run in training, written to its run folders."""
 
+import time
 from contextlib import ExitStack, closing
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -34,6 +35,17 @@ def evaluators(group: Group, agent: State) -> dict[str, Evaluator]:
     return made
 
 
+class Moment(NamedTuple):
+    """A time and a step of a run, to measure speed from."""
+
+    seconds: float
+    step: int
+
+    def speed(self, now: "Moment") -> float:
+        """Return the environment steps per second from this moment until now."""
+        return (now.step - self.step) / (now.seconds - self.seconds)
+
+
 class Recorder:
     """Evaluates a group of seeds and writes rows and metrics; to a tracking service too, where the group has one."""
 
@@ -47,6 +59,7 @@ class Recorder:
         self._physics = physics(state.actors[0].env)
         self._evaluators = evaluators(group, state.learner.agent)
         self._trackers = [Tracker(group.ways.track, run.path, state.step) for run in group.folders]
+        self._began = self._learning = Moment(time.perf_counter(), state.step)
 
     def evaluate(self, step: int, agent: State) -> str:
         """Play the evaluation episodes of a step, write a row for each. Returns the mean returns in words."""
@@ -100,8 +113,14 @@ class Recorder:
                 run.append("episodes", own)
                 own.clear()
 
-    def log(self, step: int, metrics: Metrics, speeds: dict[str, float]) -> None:
+    def log(self, step: int, metrics: Metrics) -> None:
         """Write speeds and the newest metrics of each seed. Raises DelayRLError for a metric that is not finite."""
+        now = Moment(time.perf_counter(), step)
+        speeds = {"steps_per_second": self._began.speed(now)}
+        if metrics or not self._group.program.phases:
+            speeds["learning_steps_per_second"] = self._learning.speed(now)
+        else:
+            self._learning = now
         values = jax.device_get(metrics)
         for i, (run, tracker) in enumerate(zip(self._group.folders, self._trackers, strict=True)):
             own = {name: float(x[i]) for name, x in values.items()}
