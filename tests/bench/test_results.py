@@ -390,11 +390,11 @@ def test_random_steps_say_nothing_of_the_time_left(finished, tmp_path: Path) -> 
     shutil.copytree(runs, tmp_path / "runs")
     home = tmp_path / "runs" / begun.folder
     folders.prepare(home, begun)
+    (home / "seed0").mkdir(exist_ok=True)
     lines = [{"step": 20, "steps_per_second": 1000.0}, {"step": 30, "steps_per_second": 9.0}]
     lines[1]["learning_steps_per_second"] = 5.0
     with folders.hold_cell(home):
         for metrics, speed, left in zip(lines, (None, 5.0), (None, 6.0), strict=True):
-            (home / "seed0").mkdir(exist_ok=True)
             (home / "seed0" / "metrics.jsonl").write_text(json.dumps(metrics) + "\n")
             now = progress(begun, tmp_path / "runs")
             assert now[:3] == ("running", metrics["step"], speed)

@@ -85,7 +85,7 @@ def test_official_evaluation_has_the_runs_start_state(played: Any) -> None:
 
 def test_what_is_not_finite_is_not_written(played: Any) -> None:
     with pytest.raises(DelayRLError, match="q is nan at step 1000 of seed 6: training diverged"):
-        played.started("corrected").log(1000, {"q": np.array([1.0, np.nan])})
+        played.started("corrected").log(1000, {"q": np.array([1.0, np.nan])}, True)
 
 
 def test_tensorboard_goes_on_where_the_run_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,7 +72,7 @@ class Loop:
             self.step()
             bar.update(1)
             if state.step % METRICS_EVERY == 0:
-                self._recorder.log(state.step, self._metrics)
+                self._recorder.log(state.step, self._metrics, self._learning)
             if state.step % schedule.evaluate_every == 0 or state.step == schedule.steps:
                 self.choose()  # before learning, as at every other step
                 self.learn()  # what is evaluated has learned from every step before

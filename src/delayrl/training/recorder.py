@@ -113,11 +113,11 @@ class Recorder:
                 run.append("episodes", own)
                 own.clear()
 
-    def log(self, step: int, metrics: Metrics) -> None:
+    def log(self, step: int, metrics: Metrics, learning: bool) -> None:
         """Write speeds and the newest metrics of each seed. Raises DelayRLError for a metric that is not finite."""
         now = Moment(time.perf_counter(), step)
         speeds = {"steps_per_second": self._began.speed(now)}
-        if metrics or not self._group.program.phases:
+        if learning or not self._group.program.phases:
             speeds["learning_steps_per_second"] = self._learning.speed(now)
         else:
             self._learning = now
