@@ -48,8 +48,8 @@ def section(files: list[Path], env: str = ENV) -> str:
     about = (
         f"{env}, preset `matched`, {front.STEPS[env]:,} steps, `--precision bfloat16`; {front.SEEDS} seeds where no "
         "other number is given. ± is the standard deviation over seeds, each of ten episodes; intervals are Welch's, "
-        "of 95 %, and bold where they leave out 0. § stays clear after Holm's correction for all differences here at "
-        "the end, or over training. *Arithmetic* is that of a step of the other over any-age's."
+        "of 95 %, and bold where they leave out 0. § stays clear after Holm's correction for all these differences, at "
+        "the end and over training together. *Arithmetic* is that of a step of the other over any-age's."
     )
     if "†" in rows:
         about += " † acts on the true state while it trains; VDPO has `--tokens 1280`."
@@ -69,8 +69,9 @@ def table(results: list[Result], env: str = ENV) -> str:
             if alike and (own_name, delay) in chosen and own_name != name:
                 pairs.append((delay, own_name, name, chosen[own_name, delay], other))
     pairs.sort(key=lambda pair: (delay_order(pair[0]), pair[1], -area(pair[-1]).mean()))
-    ends = holm([welch(own.curves.final, other.curves.final) for *_, own, other in pairs])
-    areas = holm([welch(area(own), area(other)) for *_, own, other in pairs])
+    at_the_end = [welch(own.curves.final, other.curves.final) for *_, own, other in pairs]
+    clear = holm(at_the_end + [welch(area(own), area(other)) for *_, own, other in pairs])
+    ends, areas = clear[: len(pairs)], clear[len(pairs) :]
     parts: dict[str, list[list[str]]] = {}
     for (delay, own_name, name, own, other), end, whole in zip(pairs, ends, areas, strict=True):
         cells = [name, ended_at(other), bold(difference(own.curves.final, other.curves.final)) + " §" * end]

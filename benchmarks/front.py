@@ -11,6 +11,7 @@ from learning.curves import curve
 from matplotlib import pyplot
 
 from delayrl.bench.results import Collected
+from delayrl.errors import DelayRLError
 from delayrl.report.figures import STYLES
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result, Setting
@@ -126,10 +127,16 @@ def choose(results: list[Result]) -> Chosen:
 
 
 def comparable(results: list[Result]) -> list[Result]:
-    """Return the results of ARMS under one protocol, preset, precision and budget, those with most seeds last."""
+    """Return the results of ARMS under one protocol, preset, precision and budget, those with most seeds last.
+
+    Raises DelayRLError if some of a task were not evaluated at the same steps: their means over training would differ.
+    """
     alike = [r for r in results if r.place.setting == Setting("corrected", "matched") and name(r) in ARMS and ended(r)]
     budget = [r for r in alike if r.condition.steps == STEPS.get(r.place.env)]
-    return sorted((r for r in budget if r.condition.overrides.get("precision") == "bfloat16"), key=lambda r: r.runs)
+    same = sorted((r for r in budget if r.condition.overrides.get("precision") == "bfloat16"), key=lambda r: r.runs)
+    if mixed := {env for env in STEPS if len({tuple(r.curves.steps) for r in same if r.place.env == env}) > 1}:
+        raise DelayRLError(f"results on {', '.join(sorted(mixed))} have evaluations at different steps")
+    return same
 
 
 def older(tables: Iterable[Collected]) -> set[tuple[str, Case]]:
@@ -177,8 +184,9 @@ def cell(result: Result | None, mark: str = "") -> str:
     if result is None:
         return ""
     within = interval(result.final_interval, normalised)
-    count = f"; {result.runs} seeds" if result.runs != SEEDS else ""
-    lines = [f"**{normalised(result.final.mean())}**{mark}", *([within + count] if within else [])]
+    count = [f"{result.runs} seeds"] if result.runs != SEEDS else []
+    below = "; ".join([within, *count] if within else count)
+    lines = [f"**{normalised(result.final.mean())}**{mark}", *([below] if below else [])]
     return "<br>".join([*lines, raw(result.curves.final)])
 
 

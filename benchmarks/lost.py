@@ -22,7 +22,10 @@ ENV = "HalfCheetah-v5"
 DRAWN = 25
 """The delay of the picture's policies."""
 LOST = 0.7
-"""An episode is lost if it returns less than this part of the best of its evaluation, both above a random policy's."""
+"""An episode is lost if it returns less than this part of the best of its evaluation, both above a random policy's.
+
+Of an evaluation whose best is below that, none is.
+"""
 HEAD = ("Δ", "policy", "seeds", "mean return", "lost", f"below {AWAY:,}", "mean of those not lost", "change")
 CHANCE = "random"
 
@@ -123,7 +126,8 @@ class Found(NamedTuple):
 def measure(runs: Runs, chance: float) -> Found:
     """Measure the second half of each run, with `chance` as the return of a random policy."""
     returns = np.array([[x for step, x in run.items() if step > max(run) / 2] for run in runs.values()])
-    lost = returns - chance < LOST * (returns.max(-1, keepdims=True) - chance)
+    best = returns.max(-1, keepdims=True)
+    lost = (best > chance) & (returns - chance < LOST * (best - chance))
     means = returns.mean(-1)
     change = np.abs(np.diff(means)).mean()
     return Found(*map(float, (means.mean(), lost.mean(), (returns < AWAY).mean(), returns[~lost].mean(), change)))

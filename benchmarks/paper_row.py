@@ -24,7 +24,7 @@ def table(results: list[Result]) -> str:
     Beside them stands what SAC without a delay returns at that step. A delayed agent is there once all its seeds have
     ended, SAC once one has.
     """
-    at = {(r.condition.agent, r.place.setting.protocol): r for r in results if r.runs}
+    at = {(r.condition.agent, r.place.setting.protocol): r for r in results if r.runs and not r.partial}
     body = []
     for protocol in PROTOCOLS:
         sac = at.get(("sac", protocol))
@@ -50,7 +50,7 @@ def then(result: Result | None, step: int) -> str:
 
 def last(result: Result) -> str:
     """Write the returns of the last evaluation, with its step."""
-    return f"{written(result, -1)}, {result.condition.steps:,} steps"
+    return f"{written(result, -1)}, {result.curves.steps[-1]:,} steps"
 
 
 def written(result: Result, index: int) -> str:

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from scipy import stats
 
+from delayrl.errors import DelayRLError
 from delayrl.report import statistics
 from delayrl.report.markup import markdown_table
 
@@ -24,7 +25,10 @@ Runs = dict[str, dict[str, dict[int, dict[int, float]]]]  # task -> who -> seed 
 
 
 def read(folder: Path) -> tuple[Runs, list[str]]:
-    """Return the mean return of each evaluation of each run, and the versions that made them, in words."""
+    """Return the mean return of each evaluation of each run, and the versions that made them, in words.
+
+    Raises DelayRLError if a run is there twice.
+    """
     runs: Runs = defaultdict(lambda: defaultdict(dict))
     versions: dict[str, set[str]] = defaultdict(set)
     for file in sorted(folder.glob("*.jsonl")):
@@ -36,7 +40,10 @@ def read(folder: Path) -> tuple[Runs, list[str]]:
                 episodes[line.get("run", 0), line["step"]].append(line["return"])
         for (run, step), returns in episodes.items():
             config = configs[run]["config"]
-            runs[config["env"]][name(config)].setdefault(config["seed"], {})[step] = float(np.mean(returns))
+            curve = runs[config["env"]][name(config)].setdefault(config["seed"], {})
+            if step in curve:
+                raise DelayRLError(f"{file}: seed {config['seed']} of {name(config)} is in another file too")
+            curve[step] = float(np.mean(returns))
         for line in configs.values():
             used = line.get("versions") or line["config"]["versions"]
             packages = ("jax", "torch", "stable-baselines3", "sbx-rl", "mujoco", "gymnasium")
@@ -114,7 +121,7 @@ def bold(text: str) -> str:
     if not text:
         return ""
     low, high = re.findall(r"[-+][\d,]+", text)[1:]
-    return f"**{text}**" if low[0] == high[0] else text
+    return f"**{text}**" if low[0] == high[0] and (low, high) != ("+0", "+0") else text
 
 
 def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any) -> Line2D:

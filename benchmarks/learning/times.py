@@ -105,7 +105,8 @@ def table(runs: Runs) -> str:
 def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
     """Write how many times as long as ours a side takes to a return; a dash where neither reaches it.
 
-    Where half of one's seeds do not, that is a bound: those count as if they had at their last evaluation.
+    Where half of one's seeds do not, that is a bound: those count as if they had at their last evaluation. The other's
+    that do not count as last.
     """
     theirs_does, ours_does = (np.isfinite(median(some, value)[1]) for some in (runs, ours))
     if not (theirs_does or ours_does):
@@ -113,7 +114,10 @@ def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
     if theirs_does and ours_does:
         return f"{median(runs, value)[1] / median(ours, value)[1]:.1f}"
     theirs, own = (
-        np.median([(reached(run, value) or (0, run.seconds[-1]))[1] for run in some]) for some in (runs, ours)
+        median(some, value)[1]
+        if does
+        else np.median([(reached(run, value) or (0, run.seconds[-1]))[1] for run in some])
+        for some, does in ((runs, theirs_does), (ours, ours_does))
     )
     return f"{'> ' if ours_does else '< '}{theirs / own:.1f}"
 

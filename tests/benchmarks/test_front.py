@@ -4,8 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import front
+import pytest
 from finished import result
 
+from delayrl.errors import DelayRLError
 from delayrl.report.results import Result
 
 
@@ -30,6 +32,11 @@ def test_the_result_of_the_first_page(tmp_path: Path) -> None:
     assert lines[0][1:] == ["**1.00**<br>3,900 ± 0"] * 3 + ["", "", " |"]
     assert lines[1][2] == "**0.30**<br>0.28 to 0.33; 2 seeds<br>1,100 ± 141"
     assert lines[2][4] == "**0.03**<br>0.03 to 0.04<br>30.0 ± 15.8"
+    lone = front.cell(replace(sac, curves=sac.curves._replace(returns=sac.curves.returns[:3])))
+    assert lone == "**1.00**<br>3 seeds<br>3,900 ± 0"
+    sparse = replace(many, curves=many.curves._replace(steps=2 * many.curves.steps))
+    with pytest.raises(DelayRLError, match="results on delayrl/Hopper-v4 have evaluations at different steps"):
+        front.comparable([many, sparse])
     shorter, other = of("bpql", late, [1.0], evaluate_every=2_000), of("bpql", late, [2.0], random_steps=20_000)
     assert [front.name(arm) for arm in (shorter, other)] == ["`bpql`", "`bpql`, `random_steps=20000`"]
     front.draw(chosen, tmp_path / "result.png")

@@ -22,6 +22,8 @@ def test_an_episode_is_lost_below_0_7_of_the_best_above_chance() -> None:
     assert found.lost == pytest.approx(1 / 6)
     assert found.others == pytest.approx((900 + 600 + 3 * 200) / 5)
     assert (found.mean, found.change) == pytest.approx(((2099 + 600) / 6, 2099 / 3 - 200))
+    hopeless = lost.measure({0: {75: [-400.0, -390, -380], 100: [0.0, 0, 0]}}, -100)
+    assert (hopeless.lost, hopeless.others) == (0, -195)  # all of the first are below chance
     assert lost.measure({0: {75: [1499.0, 1500], 100: [4000.0, 4000]}}, 0).low == 0.25
 
 

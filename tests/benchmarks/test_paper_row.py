@@ -20,6 +20,8 @@ def test_returns_at_the_papers_step_beside_sacs() -> None:
     late = of("dcac", [10_000, 20_000, 30_000], [[-90.0, -40.0, -36.0], [-91.0, -42.0, -38.0]])
     sac = replace(of("sac", [20_000, 40_000], [[-30.0, -20.0]]), seeds=3)
     unfinished = replace(of("bpql", [270_000], [[-1.0]]), seeds=3)
+    going_on = replace(of("sac", [20_000], [[-9.0], [-8.0]]), partial=True)
+    assert "sac" not in paper_row.table([late, going_on])
     lines = [line.strip("| ").split(" | ") for line in paper_row.table([late, sac, unfinished]).splitlines()[2:]]
     assert lines[0] == [
         "`dcac`",

@@ -47,4 +47,8 @@ def test_time_to_a_return(tmp_path: Path) -> None:
     assert times.ratios({5: pairs}, "ours").splitlines()[2:] == ["| 5 | slow | 2.5 | > 7.5 | > 7.5 |"]
     mixed = [times.Run([1], [24.0], [3000.0], 3.0), times.Run([1, 2], [24.0, 96.0], [0.0, 0.0], 3.0)]
     assert times.ratio(mixed, fast, 1000) == "> 2.5"  # 24 s, and more than 96
+    later = [
+        times.Run([1], [seconds], [value], 9.0) for seconds, value in ((60.0, 3000.0), (90.0, 3000.0), (70.0, 0.0))
+    ]
+    assert times.ratio([times.Run([1], [180.0], [0.0], 9.0)], later, 1000) == "> 2.0"  # over 90 s, not over 70
     assert (tmp_path / "times.png").stat().st_size > 5_000

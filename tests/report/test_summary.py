@@ -57,8 +57,8 @@ def test_without_anchors_there_are_raw_returns_and_nothing_else() -> None:
         entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
         assert math.isnan(entry.value)
         assert entry.raw == 3
-        lacks = {"sac": "SAC without a delay", "random": "the random policy"}[missing]
-        assert f"Returns on delayrl/Ant-v4 are not normalised: {lacks} has no rows" in markdown(summary, "t", {})
+        lacks = {"sac": "SAC without a delay has not ended", "random": "the random policy has no rows"}[missing]
+        assert f"Returns on delayrl/Ant-v4 are not normalised: {lacks}" in markdown(summary, "t", {})
         assert math.isnan(entry.area)
         assert np.isnan(entry.interval).all()
         assert not summary.aggregates
@@ -127,6 +127,18 @@ def test_delay_free_sac_of_another_protocol_preset_or_budget_is_no_anchor(change
     cells = small() | {"sac": standing("sac", "delayrl/Ant-v4", 0, 2, **{"steps": 300} | change)}
     summary = summarise(anchored(cells, vdpo=[[0.0, 1, 2], [0.0, 1, 4]]), [*cells.values()])
     assert math.isnan(of(summary, "vdpo").reference_anchor.value)
+
+
+def test_the_plainest_sac_is_the_anchor_whatever_its_budget() -> None:
+    """Not the one with the fewest overrides: how often it was evaluated leaves it what it is."""
+    cells, steps = small(), 300
+    plain = {"precision": "bfloat16", "evaluate_every": 100, "replay_capacity": 300}
+    cells["sac"] = standing("sac", "delayrl/Ant-v4", 0, 2, steps=steps, overrides=plain)
+    cells["layer"] = standing("sac", "delayrl/Ant-v4", 0, 5, id="0", steps=steps, overrides={"critic_norm": "layer"})
+    rows = anchored(cells, vdpo=[[0.0, 0, 60]] * 2, sac=[[0.0, 0, 110]] * 2, layer=[[0.0, 0, 999]] * 5)
+    result = of(summarise(rows, [*cells.values()]), "vdpo")
+    assert result.reference_anchor.value == 110
+    assert result.final.tolist() == [0.5, 0.5]
 
 
 def test_the_threshold_alone_may_be_of_a_longer_reference() -> None:
@@ -247,6 +259,31 @@ def test_a_failed_seed_beside_one_that_has_ended() -> None:
     entry = summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"]
     assert entry.note == "1 of 3 seeds · failed at 100 of 300 steps"
     assert of(summarise(anchored(cells, vdpo=[[0.0, 1, 60]]), [*cells.values(), todo]), "vdpo").unfinished == "begun"
+
+
+def test_an_agent_with_a_failed_seed_is_not_compared_by_the_others() -> None:
+    """Those that did not fail are the better ones. The agent's numbers on the task remain, with what happened."""
+    cells = small() | {"bpql": standing("bpql", "delayrl/Ant-v4", 5, 2, steps=300)}
+    failed = standing("vdpo", "delayrl/Ant-v4", 5, (2,), id="1", steps=300, step=100, state="failed")
+    rows = anchored(cells, vdpo=[[0.0, 1, 60], [0.0, 1, 80]], bpql=[[0.0, 1, 20], [0.0, 1, 40]])
+    summary = summarise(rows, [*cells.values(), failed])
+    assert [aggregate.label for aggregate in summary.aggregates] == ["bpql"]
+    assert not summary.comparisons
+    assert summary.tables[0].entries["delayrl/Ant-v4", 5, "vdpo"].note == "2 of 3 seeds · failed at 100 of 300 steps"
+    assert summarise(rows, [*cells.values()]).comparisons
+
+
+def test_tasks_count_alike_whatever_their_seeds() -> None:
+    """Of ten seeds on one task and five on another, five of each: the others would draw the mean to their task."""
+    curves = {"random": [[0.0] * 3] * 2, "sac": [[0.0, 0, 100]] * 2}
+    cells, rows = {}, []
+    for env, seeds, score in (("delayrl/Ant-v4", 10, 20.0), ("delayrl/Hopper-v4", 5, 80.0)):
+        for agent, own in (curves | {"vdpo": [[0.0, 0, score]] * seeds}).items():
+            cell = standing(agent, env, 5 if agent == "vdpo" else 0, len(own), id=f"{agent} {env}", steps=300)
+            cells[cell[0].id] = cell
+            rows += [row for seed, values in enumerate(own) for row in curve(cell, seed, values)]
+    (aggregate,) = summarise(rows, [*cells.values()]).aggregates
+    assert (aggregate.iqm, aggregate.runs, aggregate.tasks) == (pytest.approx(0.5), 10, 2)
 
 
 def test_over_all_delays_conditions_are_counted() -> None:

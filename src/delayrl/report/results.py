@@ -20,6 +20,8 @@ from delayrl.run.cost import Cost
 
 PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
 """Columns of the paper's tables."""
+BUDGET = frozenset({"steps", "evaluate_every", "evaluation_episodes", "replay_capacity", "precision"})
+"""Options that leave an agent what it is."""
 
 
 class Curves(NamedTuple):
@@ -223,10 +225,13 @@ def make_results(
 
 
 def ended_by_delay(results: Iterable[Result]) -> dict[tuple[Setting, int | str | None], list[Result]]:
-    """Group learners whose seeds have ended by setting and delay, in order; under None, those of all constant ones."""
+    """Group learners whose seeds have ended by setting and delay, in order; under None, those of all constant ones.
+
+    Those of which a cell has failed are left out: the seeds that did not fail are the better ones.
+    """
     groups: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
     for result in results:
-        if result.is_anchor or result.partial or not result.runs:
+        if result.is_anchor or result.partial or not result.runs or result.progress.state == "failed":
             continue
         setting, delay = result.place.setting, result.place.delay
         groups[setting, delay].append(result)
@@ -306,8 +311,8 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
         random = Anchor(best.curves.returns.mean(1), best.smoothed[:, -1], "random")
     if same:
         reference = threshold = _reference(min(same, key=_fewest_overrides))
-    elif longer:
-        threshold = _reference(min(longer, key=_longest))
+    elif longer:  # the plainest, and of those the longest
+        threshold = _reference(min(longer, key=lambda o: (_changed(o), -o.condition.steps, _fewest_overrides(o))))
     return replace(result, random_anchor=random, reference_anchor=reference, threshold_anchor=threshold)
 
 
@@ -317,9 +322,9 @@ def _reference(result: Result) -> Anchor:
 
 
 def _fewest_overrides(result: Result) -> tuple[Any, ...]:
-    return len(result.condition.overrides), -result.runs, _order(result)
+    return _changed(result), len(result.condition.overrides), -result.runs, _order(result)
 
 
-def _longest(result: Result) -> tuple[Any, ...]:
-    """Sort the plainest first, and of those the longest."""
-    return len(result.condition.overrides.keys() - {"steps"}), -result.condition.steps, _fewest_overrides(result)
+def _changed(result: Result) -> int:
+    """Count the options that make it another agent than the preset's."""
+    return len(result.condition.overrides.keys() - BUDGET)

@@ -207,6 +207,9 @@ def _make_aggregates(results: Iterable[Result]) -> list[Aggregate]:
 
 
 def _aggregate(setting: Setting, delay: int | str | None, label: str, results: list[Result]) -> Aggregate:
+    """Aggregate as many seeds of each task as the one with fewest has: else tasks with more would count for more."""
+    fewest = min(result.runs for result in results)
+    results = [replace(r, curves=r.curves._replace(returns=r.curves.returns[:fewest])) for r in results]
     pooled = np.concatenate([result.final for result in results])
     strata = make_strata(results)
     iqm = float(statistics.interquartile_mean(pooled))

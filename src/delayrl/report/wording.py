@@ -120,8 +120,9 @@ CELLS_CAPTION = (
     "table of anchors."
 )
 AGGREGATE_CAPTION = (
-    "Over all runs of all tasks; 95 % interval. Agents that lack a task on which another has ended at this delay are "
-    "left out, because means over different tasks cannot be compared."
+    "Over all tasks, with as many runs of each as the one with fewest has; 95 % interval. Agents that lack a task on "
+    "which another has ended at this delay are left out, because means over different tasks cannot be compared. So is "
+    "a result with a failed run."
 )
 COMPARISON_CAPTION = (
     "How probable it is that a run of the row's agent ends above a run of the column's on the same task, in the mean "
@@ -129,7 +130,8 @@ COMPARISON_CAPTION = (
     "probability is bold where it excludes 0.5. Near 0 and 1 its interval is too narrow: 1.00 to 1.00 says only that "
     "no run of the one ended below one of the other. Below stands the difference of the mean normalised returns, with "
     "the anchors' uncertainty, where all these tasks have anchors. With fewer than "
-    f"{FEWEST} runs of either agent on a task neither has an interval. Of many comparisons some are bold by chance."
+    f"{FEWEST} runs of either agent on a task neither has an interval. Of many comparisons some are bold by chance. "
+    "Results with a failed run are left out."
 )
 
 
@@ -256,7 +258,7 @@ def raw(summary: Summary) -> list[str]:
             continue
         why = f"SAC without a delay ({number(reference)}) is not better than the random policy ({number(random)})"
         if math.isnan(random) or math.isnan(reference):
-            why = "SAC without a delay has no rows of this protocol, preset and length"
+            why = "SAC without a delay has not ended under this protocol, preset and length"
             if math.isnan(random):
                 why = "the random policy has no rows of this protocol"
         tasks.setdefault(why, []).append(result.place.env)
