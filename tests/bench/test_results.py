@@ -241,6 +241,8 @@ def test_of_equal_rows_those_that_have_ended_count(finished, tmp_path: Path) -> 
         "DELETE FROM cells WHERE number = 0",
         "UPDATE cells SET state = 'well'",
         "UPDATE cells SET steps_per_second = 'fast'",
+        "UPDATE cells SET step = 9e999",
+        "UPDATE cells SET cell = json_set(cell, '$.seeds', json('[]'))",
         "UPDATE runs SET config = '{'",
         "UPDATE runs SET config = '[]'",
         "UPDATE runs SET config = json_set(config, '$.cost', 1)",

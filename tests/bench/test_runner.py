@@ -1,6 +1,7 @@
 """Running a grid on this machine: cells are skipped, resumed, tried again, stopped, locked."""
 
 import contextlib
+import errno
 import json
 import os
 import random
@@ -19,11 +20,12 @@ from delayrl.bench.backends.local import LocalBackend
 from delayrl.bench.grid import load_grid
 from delayrl.bench.runner import Completion, run_cells
 from delayrl.bench.status import line, seconds_left, standing
-from delayrl.bench.worker import Outcome
+from delayrl.bench.worker import Outcome, work
 from delayrl.cli.bench import idle, time_limit
 from delayrl.cli.main import main
 from delayrl.run.cell import Cell, Progress
 from delayrl.run.condition import Condition
+from delayrl.run.disk import disk_errors
 
 
 @pytest.fixture(scope="module")
@@ -239,6 +241,58 @@ def test_tries_are_bounded(tmp_path: Path) -> None:
     assert [p.state for _, p in now] == ["failed", "todo", "failed"]
     assert now[0][1].line == completion.failed["sac"]
     assert "2 failed" in line(now, 1)
+
+
+def test_only_deaths_count_as_tries(tmp_path: Path, monkeypatch) -> None:
+    """A worker that somebody stops has not died."""
+    monkeypatch.setattr("delayrl.bench.runner.RETRY", 0.01)
+    stopped = Outcome("stopped", "stopped before it began")
+    backend = Script(sac=[stopped] * 4 + [DIED, stopped, DONE], bpql=[DIED, stopped, DIED])
+    completion = run_cells(cells("sac", "bpql"), tmp_path, backend, tries=2)
+    assert [cell.condition.agent for cell in completion.done] == ["sac"]
+    assert list(completion.failed) == ["bpql"]
+
+
+def test_workers_reach_a_checkpoint_if_their_runner_fails(tmp_path: Path, monkeypatch) -> None:
+    """As they do if it is killed: they are asked to stop, and are not killed at once."""
+    save = "import pathlib, signal, sys, time\n"
+    save += "signal.signal(signal.SIGTERM, lambda *_: (time.sleep(0.5), pathlib.Path(sys.argv[1]).touch(), exit()))\n"
+    save += "pathlib.Path(sys.argv[1] + '-begun').touch()\ntime.sleep(60)"
+
+    def start(folder: Path, device: str | None, core: int | None) -> subprocess.Popen:
+        words = [sys.executable, "-c", save, str(tmp_path / "saved")]
+        return subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def tick() -> None:
+        if (tmp_path / "saved-begun").exists():
+            raise delayrl.DelayRLError("no")
+
+    monkeypatch.setattr("delayrl.bench.backends.local.start_worker", start)
+    with pytest.raises(delayrl.DelayRLError, match="no"):
+        run_cells(cells("sac"), tmp_path, LocalBackend(tmp_path, 1), tick=tick)
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_disk_that_does_not_answer_is_not_the_end(tmp_path: Path, monkeypatch) -> None:
+    """Neither while the status is read, nor in a worker, where another try may meet a disk that does."""
+    (some,) = cells("random")
+    folder = tmp_path / some.folder
+    folders.prepare(folder, some)
+
+    def stale(path: Path) -> list[Path]:
+        raise delayrl.DelayRLError(f"{path} cannot be read: Stale file handle")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folders, "checkpoint_folders", stale)
+        assert folders.stored(folder, (0,)) == (0, False)
+    for number, kind in ((errno.EIO, "died"), (errno.ENOSPC, "failed")):
+
+        def refuse(*_: object, number: int = number) -> None:
+            with disk_errors(folder):
+                raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr("delayrl.bench.worker._train", refuse)
+        assert work(folder).kind == kind
 
 
 def test_a_worker_that_cannot_be_started(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import re
 import shutil
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,6 +43,23 @@ def test_script(tmp_path: Path) -> None:
     subprocess.run(["bash", "-n"], input=text, text=True, check=True)
     with pytest.raises(delayrl.DelayRLError, match="--sbatch takes an option"):
         script(grid, grid.cells, tmp_path, options=["--x\nrm"])
+
+
+def test_a_signal_before_the_runner_has_begun_requeues(tmp_path: Path, monkeypatch) -> None:
+    """While it reads its grid the signal ends it, before it could say that it goes on later."""
+    grid, begun, requeued = load_grid(tiny(tmp_path)), tmp_path / "begun", tmp_path / "requeued"
+    programs = {"python": f'touch "{begun}"\nexec sleep 30', "scontrol": f'echo "$@" > "{requeued}"'}
+    for name, text in programs.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    env = os.environ | {"PATH": f"{tmp_path}:{PATH}", "SLURM_ARRAY_TASK_ID": "0", "SLURM_JOB_ID": "7"}
+    process = subprocess.Popen(["bash", "-c", script(grid, grid.cells, tmp_path)], env=env)
+    while not begun.exists():
+        time.sleep(0.05)
+    process.terminate()
+    assert process.wait(20) == 143
+    assert requeued.read_text() == "requeue 7\n"
 
 
 def test_written_for_another_machine(tmp_path: Path, capsys, monkeypatch) -> None:

@@ -1,6 +1,8 @@
 """What a user types. Errors: one line on stderr, exit status 2, no traceback."""
 
 import argparse
+import errno
+import io
 import json
 import os
 import shutil
@@ -269,6 +271,19 @@ def test_bad_input(arguments: str, words: str, tmp_path: Path, monkeypatch, caps
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EPIPE])
+def test_what_cannot_be_told_ends_no_work(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Progress goes to stderr; a log on a full disk, or a reader that is gone, must not end the run that it is of."""
+
+    class Refuses(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(sys, "stderr", Refuses())
+    main(["train", "random", "--env", "Reacher-v5", "--out", str(tmp_path / "run"), *SMALL[:8]])
+    assert newest(tmp_path / "run").step == 240
+
+
 def test_bad_run_folders(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken"
     shutil.copytree(run, broken)
@@ -288,6 +303,21 @@ def test_runs_tells_the_steps_of_one_without_evaluations(run: Path, tmp_path: Pa
     main(["runs", str(tmp_path), "--json"])
     (row,) = json.loads(capsys.readouterr().out)
     assert (row["step"], row["steps"], row["return"]) == (240, 240, None)
+
+
+def test_a_run_whose_disk_does_not_answer_hides_no_others(run: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(run, tmp_path / name)
+
+    def stale(path: Path) -> list[Path]:
+        if path.name == "a":
+            raise delayrl.DelayRLError(f"{path} cannot be read: Stale file handle")
+        return []
+
+    monkeypatch.setattr("delayrl.cli.runs.checkpoint_folders", stale)
+    main(["runs", str(tmp_path), "--json"])
+    first, second = json.loads(capsys.readouterr().out)
+    assert ("Stale" in first["error"], second["error"]) == (True, None)
 
 
 def test_a_name_that_cannot_be_shown_is_escaped(run: Path, tmp_path: Path) -> None:

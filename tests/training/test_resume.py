@@ -166,6 +166,16 @@ def test_stopped_between_checkpoints_and_resumed(agent: str, block: int, tmp_pat
     assert_same_networks(resumed, whole)
 
 
+def test_a_run_that_begins_anew_is_of_its_new_code_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ended before its first checkpoint has left nothing; the code that is named made the rows."""
+    monkeypatch.setattr("delayrl.training.resume.versions", lambda: {"commit": "old"})
+    with at_step(50, killed), pytest.raises(KilledError):
+        train("random", tmp_path)
+    monkeypatch.setattr("delayrl.training.resume.versions", lambda: {"commit": "new"})
+    config = train("random", tmp_path).config
+    assert (config["versions"]["commit"], config.get("later_versions")) == ("new", None)
+
+
 def test_a_second_interrupt_does_not_wait_for_the_loop() -> None:
     """While something compiles, nobody looks at the event. SIGTERM comes from machines, and may come twice."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it

@@ -169,9 +169,10 @@ def claim(runs: Path, grid: "Grid", *, check_only: bool = False) -> None:
 
 
 def _newest_checkpoint(run: Path) -> Checkpoint | None:
-    for path in checkpoint_folders(run):
-        with contextlib.suppress(DelayRLError):
-            return read_checkpoint(path)
+    with contextlib.suppress(DelayRLError):  # a disk may not answer for a moment
+        for path in checkpoint_folders(run):
+            with contextlib.suppress(DelayRLError):
+                return read_checkpoint(path)
     return None
 
 

@@ -282,7 +282,7 @@ def _open(file: Path) -> Iterator[sqlite3.Connection]:
             if version == (str(SCHEMA),):
                 yield table
                 return
-    except (sqlite3.Error, ValueError, KeyError, TypeError, RecursionError, DelayRLError) as error:
+    except (sqlite3.Error, ValueError, KeyError, TypeError, OverflowError, RecursionError, DelayRLError) as error:
         raise DelayRLError(f"{file} is no table of results, or damaged: {error}") from error
     other = version[0] if version else "none"
     raise DelayRLError(f"{file} has schema version {other}, this program reads {SCHEMA}: collect into another file")

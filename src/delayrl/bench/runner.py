@@ -95,6 +95,9 @@ def run_cells(
                 queue.end(cell, outcome, now)
             tick()
             time.sleep(PAUSE)
+    except Exception:  # a second Ctrl-C does not wait
+        queue.let_stop()
+        raise
     finally:
         backend.close()
     completion = queue.completion
@@ -149,7 +152,7 @@ class _Queue:
         self.running -= 1
         kind, line = outcome
         step = folders.stored(self._runs / cell.folder, cell.seeds)[0]
-        in_vain = 0 if step > self._step[cell.id] or kind == "locked" else self._in_vain[cell.id] + 1
+        in_vain = 0 if step > self._step[cell.id] or kind == "locked" else self._in_vain[cell.id] + (kind == "died")
         self._in_vain[cell.id], self._step[cell.id] = in_vain, step
         if kind == "done":
             self.completion.done.append(cell)
@@ -163,7 +166,7 @@ class _Queue:
         elif kind == "locked":  # another runner has it, and may leave it unfinished
             self._retry(cell, now + RETRY)
         else:
-            self._retry(cell, now + RETRY * in_vain)  # what killed it may last for a while
+            self._retry(cell, now + RETRY * max(in_vain, kind == "stopped"))  # what ended it may last for a while
             self._say(f"again from step {step:,}: {cell}: {line}")
 
     def stop(self) -> None:
@@ -172,6 +175,14 @@ class _Queue:
         self.completion.unfinished += self.waiting
         self.waiting.clear()
         self._backend.stop()
+
+    def let_stop(self) -> None:
+        """Let what runs reach a checkpoint, whatever may be wrong here."""
+        self._backend.stop()
+        until = time.monotonic() + GRACE
+        while self.running > 0 and time.monotonic() < until:
+            self.running -= len(self._backend.ended())
+            time.sleep(PAUSE)
 
     def _retry(self, cell: Cell, not_before: float) -> None:
         self.waiting.append(cell)

@@ -1,12 +1,13 @@
 """The entry point of `delayrl`. An error that a user can cause is one line on stderr and a non-zero exit status."""
 
+import contextlib
 import io
 import os
 import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, TextIO
 
 from delayrl import __version__
 from delayrl.cli.console import Parser
@@ -30,9 +31,30 @@ COMMANDS = {
 """Each command is the module of its name in this folder, with `run(given)` and, if it has options, `add_options`."""
 
 
+class _Progress:
+    """A stderr that never raises: a reader that is gone, or a full disk, ends no work that it was to be told of."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that the words after `delayrl` name; None for the words of the process."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
+    if sys.stderr is not None and not isinstance(sys.stderr, _Progress):
+        sys.stderr = _Progress(sys.stderr)  # type: ignore[assignment]
     if isinstance(sys.stdout, io.TextIOWrapper):  # what a terminal, or a name in a file, cannot show is escaped
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -45,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         print(f"delayrl: {needed}", file=sys.stderr)
         sys.exit(2)
-    except BrokenPipeError:  # before OSError, its base class
+    except BrokenPipeError:  # of stdout, whose reader has seen enough; before OSError, its base class
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         print(f"delayrl: {error.strerror or error}: {error.filename or ''}".rstrip(": "), file=sys.stderr)

@@ -35,11 +35,11 @@ def _row(run: Run) -> dict[str, Any]:
     """Return the columns of a run; `error` is the line that says why it cannot be read."""
     row: dict[str, Any] = dict.fromkeys((*NAMES, "step", "steps", "return")) | {"run": str(run.path), "error": None}
     try:
-        config, curve = run.config, run.curve()
+        config, curve, stored = run.config, run.curve(), checkpoint_folders(run.path)
     except DelayRLError as error:
         return row | {"error": str(error)}
     evaluated = max(curve.steps, default=0)
-    step = max([int(evaluated), *(int(folder.name) for folder in checkpoint_folders(run.path))])
+    step = max([int(evaluated), *(int(folder.name) for folder in stored)])
     last = float(curve.returns[-1].mean()) if evaluated else None
     columns = {name: config.get(name) for name in NAMES} | {"delay": run.delay}
     return row | columns | {"step": step, "steps": config["schedule"]["steps"], "return": last}

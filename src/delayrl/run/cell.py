@@ -36,7 +36,7 @@ class Cell:
     def from_json(cls, values: Mapping[str, Any], id: str) -> Self:
         """Make a cell of stored values. Raises DelayRLError if one is missing or of another type."""
         seeds = values.get("seeds")
-        if not isinstance(seeds, list):
+        if not isinstance(seeds, list) or not seeds or any(type(seed) is not int for seed in seeds):
             raise DelayRLError("no good seeds")
         return cls(condition_of(values), tuple(seeds), id)
 

@@ -39,7 +39,7 @@ while kill -0 $runner 2>/dev/null; do # the signal ended `wait`, not the runner
     wait $runner
     status=$?
 done
-if [ $status -eq {stopped} ]; then
+if [ $status -eq {stopped} ] || [ $status -eq 143 ]; then # 143: the signal came before the runner had begun
     scontrol requeue "$SLURM_JOB_ID"
 fi
 exit $status
