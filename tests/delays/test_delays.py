@@ -235,7 +235,14 @@ def test_a_delay_in_the_other_unit(value: DelayLike, step: float, words: str) ->
     [
         *(("0", 0), ("4", 4), ("uniform:2:4", 2), ("uniform:2:4@wait", 4), ("uniform:2:4@raw", 2), ("poisson:2:5", 0)),
         *(("gilbert:3:1:0.2:0.4", 1), ("walk:8", 0), ("recorded:4,2,6,", 2), ("paper-stochastic-5", 1)),
-        *(("gamma:20:2:30", 15), ("choice:0=0,5=1", 5), ("walk:3:0.5+action=2", 2)),
+        ("recorded:" + "5," * 1999 + "1,", 5),  # 1 is one in two thousand
+        *(
+            ("gamma:1e-200:1e-200:3", 1),
+            ("gamma:1e200:1e200:3", 1),
+            ("gamma:20:2:30", 15),
+            ("choice:0=0,5=1", 5),
+            ("walk:3:0.5+action=2", 2),
+        ),
         *(("uniform:0:1999", 1), ("1+action=uniform:1:3@wait", 4)),
         *(("episode:2:4", 2), ("80~15", 80), ("2+action=3+reward=1", 5), ("uniform:1:3+action=episode:2:4", 3)),
     ],

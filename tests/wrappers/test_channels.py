@@ -570,12 +570,22 @@ def test_one_delay_is_enough() -> None:
     assert DelayedVector(vectors(lambda: Delayed(Journal(5), 0)), 2).delay == as_delay(2)
 
 
-def test_one_delay_is_enough_in_other_processes() -> None:
+@pytest.mark.parametrize("delay", [2, "0+reward=1"])
+def test_one_delay_is_enough_in_other_processes(delay: int | str) -> None:
     """Their environments show what they are at the first reset."""
-    wrappers, spawn = [functools.partial(Delayed, delay=2)], {"context": "spawn"}  # JAX warns of forks
+    wrappers, spawn = [functools.partial(Delayed, delay=delay)], {"context": "spawn"}  # JAX warns of forks
     inside = gym.make_vec("Pendulum-v1", 2, "async", wrappers=wrappers, vector_kwargs=spawn)
     with contextlib.closing(DelayedVector(inside, 1)) as env, pytest.raises(delayrl.DelayRLError, match="already"):
         env.reset(seed=0)
+
+
+@pytest.mark.parametrize("delay", ["2", "2+action=1"])
+@pytest.mark.parametrize("shape", [(2,), (1, 1), (2, 2), ()])
+def test_actions_of_a_vector_have_a_row_for_each_environment(delay: str, shape: tuple[int, ...]) -> None:
+    env = DelayedVector(vectors(lambda: gym.make("Pendulum-v1")), delay)
+    env.reset(seed=0)
+    with pytest.raises(delayrl.DelayRLError, match=r"actions have the shape \(2, 1\); got "):
+        env.step(np.zeros(shape, np.float32))
 
 
 def vectors(make: Any, **options: Any) -> Any:

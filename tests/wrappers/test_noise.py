@@ -163,6 +163,7 @@ def test_the_papers_noisy_tasks() -> None:
         (lambda: NoisyActions(Recorder(), -0.1), "from 0 to 1; got -0.1"),
         (lambda: NoisyActions(Recorder(), "0.1"), "from 0 to 1; got '0.1'"),
         (lambda: NoisyActions(Delayed(Recorder(), 1), 0.1), "goes inside Delayed"),
+        (lambda: NoisyActions(NoisyActions(Recorder(), 0.1), 0.1), "random actions already"),
         (lambda: NoisyActions(gym.make("CartPole-v1"), 0.1), "continuous"),
     ],
 )

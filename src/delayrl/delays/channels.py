@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Literal, get_args
@@ -181,17 +182,23 @@ def _shortest(law: DelayLaw) -> int:
     match law:
         case Constant():
             return law.steps
-        case laws.Choice() | laws.Markov():
-            shares = law.probabilities if isinstance(law, laws.Choice) else law.stationary
-            steps, each = zip(*sorted(zip(law.steps, shares, strict=True)), strict=True)
-            return next(n for n, share in zip(steps, accumulate(each), strict=True) if share >= RARE)
+        case laws.Choice():
+            return _first_not_rare(law.steps, law.probabilities)
+        case laws.Markov():
+            return _first_not_rare(law.steps, law.stationary)
         case laws.Recorded():
-            return min(law.steps)
+            return _first_not_rare(law.steps, [1 / len(law.steps)] * len(law.steps))
         case PerEpisode():
             return _shortest(law.law)
         case Sum():
             return _shortest(law.law) + _shortest(law.lag)
     return 0  # of a user's law it is unknown
+
+
+def _first_not_rare(steps: Sequence[int], shares: Iterable[float]) -> int:
+    """Return the least of some delays, but for those that together are RARE."""
+    ordered, each = zip(*sorted(zip(steps, shares, strict=True)), strict=True)
+    return next(n for n, share in zip(ordered, accumulate(each), strict=True) if share >= RARE)
 
 
 def short_label(text: int | str) -> int | str:

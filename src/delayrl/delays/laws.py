@@ -212,7 +212,7 @@ def gamma(mean: float, deviation: float, maximum: int) -> Choice:
     deviation = _positive(deviation, "the standard deviation of a gamma delay")
     if not 1e-3 <= deviation / mean <= 1e3:
         raise DelayRLError(f"a gamma delay's deviation is between 1/1000 and 1000 means; got {deviation:g}, {mean:g}")
-    shape, scale = (mean / deviation) ** 2, deviation**2 / mean
+    shape, scale = (mean / deviation) ** 2, deviation * (deviation / mean)
     edges = [_gamma_below(shape, k / scale) for k in range(whole_steps(maximum) + 1)]
     weights = np.clip(np.diff(edges, prepend=0.0), 0, None)  # the series may be off by rounding errors
     if not weights.sum() > 0:

@@ -9,7 +9,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from delayrl.errors import DelayRLError
-from delayrl.wrappers.layers import check_spaces, name_of
+from delayrl.wrappers.layers import check_spaces, layers_of, name_of
 from delayrl.wrappers.single import Info, find_delayed
 
 
@@ -28,7 +28,7 @@ class NoisyActions(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray
         probability: of a random action at each step, from 0 to 1.
 
     Raises:
-        DelayRLError: a probability outside [0, 1], an environment that is delayed already, unsuitable spaces.
+        DelayRLError: a probability outside [0, 1], an environment that is delayed or noisy already, unsuitable spaces.
     """
 
     def __init__(self, env: gym.Env[NDArray[Any], NDArray[Any]], probability: float) -> None:
@@ -36,6 +36,8 @@ class NoisyActions(gym.Wrapper[NDArray[Any], NDArray[Any], NDArray[Any], NDArray
             raise DelayRLError(f"the probability of a random action must be from 0 to 1; got {probability!r}")
         if find_delayed(env):
             raise DelayRLError("NoisyActions goes inside Delayed: Delayed(NoisyActions(task, 0.1), delay)")
+        if any(isinstance(layer, NoisyActions) for layer in layers_of(env)):  # both would draw the same random numbers
+            raise DelayRLError(f"{name_of(env)} executes random actions already: give it one NoisyActions")
         check_spaces(name_of(env), env.observation_space, env.action_space)
         assert isinstance(env.action_space, Box)
         RecordConstructorArgs.__init__(self, probability=probability)

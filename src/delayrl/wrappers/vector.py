@@ -86,8 +86,10 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
                 f"DelayedVector takes and gives NumPy arrays, but the environments give {kind}: convert them inside, "
                 "e.g. with gymnasium.wrappers.vector.ArrayConversion"
             )
-        if {"age", "actions", "mask"} <= infos.keys() and np.size(infos["mask"]):  # a Delayed in processes of their own
-            raise DelayRLError(TWICE)
+        if {"age", "actions", "mask"} <= infos.keys():  # a Delayed in processes of their own
+            get: Any = getattr(self.env, "get_attr", lambda _: ())  # not all vectors have it
+            if np.size(infos["mask"]) or any(own.reward.maximum for own in get("delay")):
+                raise DelayRLError(TWICE)
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         for i in np.flatnonzero(mask):
             self._transits[i].reset(truth[i], seeds[i] if seeds is not None else None)
@@ -98,6 +100,8 @@ class DelayedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], Info]:
         """Issue an action in every environment. Returns what has arrived by the next step."""
         actions = np.array(actions, self._dtype)
+        if actions.shape != self.env.action_space.shape:
+            raise DelayRLError(f"actions have the shape {self.env.action_space.shape}; got {actions.shape}")
         none = np.zeros(self.num_envs, bool)
         # an environment that this step only resets ignores its action
         reset_only = self._ended if self._mode == "NextStep" else none
