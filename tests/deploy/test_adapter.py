@@ -256,6 +256,11 @@ def test_the_actor_of_stable_baselines(tmp_path: Path) -> None:
     for (w, b), (wanted_w, wanted_b) in zip(found, layers, strict=True):
         np.testing.assert_array_equal(w, wanted_w)
         np.testing.assert_array_equal(b, wanted_b)
+    model.get_vec_normalize_env = lambda: SimpleNamespace(norm_obs=False)
+    assert len(stable_baselines_layers(model)) == len(layers)
+    model.get_vec_normalize_env = lambda: SimpleNamespace(norm_obs=True)
+    with pytest.raises(DelayRLError, match="VecNormalize normalises"):
+        stable_baselines_layers(model)
     with pytest.raises(DelayRLError, match="has no actor"):
         stable_baselines_layers(SimpleNamespace(policy=SimpleNamespace(mlp_extractor=None)))
 

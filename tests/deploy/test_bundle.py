@@ -1,5 +1,6 @@
 """A bundle may come from anybody: broken and malicious ones give a one-line error; nothing runs or is written."""
 
+import contextlib
 import json
 import os
 import pickle
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -18,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from delayrl import deploy
+from delayrl.agents.normalised import Moments
 from delayrl.cli.main import main
 from delayrl.deploy import Bundle, load_bundle
 from delayrl.deploy.backends.network import parse
@@ -26,6 +29,7 @@ from delayrl.deploy.export import network_of
 from delayrl.deploy.files import DOCUMENT, GRAPH, WEIGHTS, checksum, read_files, seal, write_files
 from delayrl.deploy.packing import check_same, pack
 from delayrl.errors import DelayRLError
+from delayrl.play.policy import Policy
 
 
 @pytest.fixture(scope="module")
@@ -455,6 +459,25 @@ def test_the_command_line_says_it_in_one_line(bundle: Path, tmp_path: Path, caps
         assert (end.value.code, out, err.count("\n")) == (2, "", 1)
         assert "not a safetensors file" in err
     assert not (tmp_path / "executed").exists()
+
+
+def test_the_check_of_an_export_sees_where_the_policy_works() -> None:
+    """Far from 0 single precision has few digits left; around 0 this network and its bundle agree."""
+    policy = policy_of("bpql, normalised")
+    size, seen = policy.spec.obs_size, 1e6
+    for mean, right in ((0.0, True), (1e3, True), (5e5, False)):
+        moments = Moments(jnp.float32(seen), jnp.full(size, mean), jnp.full(size, seen))
+        state = policy.state._replace(moments=moments)
+        moved = Policy(policy.agent, state, policy.spec, policy.low, policy.high)
+        network, arrays = network_of(moved)
+        usual = np.full(size, mean, np.float32), np.ones(size, np.float32)
+
+        def act(obs: np.ndarray, actions: np.ndarray, age: int, moved: Any = moved) -> np.ndarray:
+            return moved.act(obs, {"age": age, "actions": actions})
+
+        check_same(network, arrays, act, "differs")
+        with contextlib.nullcontext() if right else pytest.raises(DelayRLError, match="differs: at age"):
+            check_same(network, arrays, act, "differs", usual)
 
 
 def test_the_check_of_an_export_sees_the_oldest_ages() -> None:

@@ -22,7 +22,7 @@ from delayrl.cli.main import main
 from delayrl.cli.measure import _show_environment
 from delayrl.delays import as_delay
 from delayrl.envs.task import quiet
-from delayrl.measure import from_log, probe
+from delayrl.measure import correlate, from_log, probe
 from delayrl.measure.ages import rounded_up_steps
 from delayrl.measure.reading import Table, read_signals
 from delayrl.wrappers import AugmentedObservation, Delayed
@@ -877,6 +877,47 @@ def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert (result["train_with"], result["in_step"], result["steps"]) == ("episode:3:4", "4", {"4": 380})
     assert "replay" not in result
     assert "No such file" in refused(capsys, "measure", path, "--save", tmp_path / "no" / "x.txt")
+
+
+def test_unrelated_signals_rarely_show_a_delay() -> None:
+    """A few short logs of a thousand; 27 of a thousand when far lags were not weighed by their rows."""
+    random, episode, shown = np.random.default_rng(5), np.zeros(200), 0
+    for _ in range(600):
+        u, y = correlate.innovations(random.normal(size=(200, 1)), random.normal(size=(200, 1)), episode)
+        sums, size = correlate.blocks(u, y, 20, 8)
+        shown += correlate.onset(correlate.correlation(sums, size, 20)) is not None
+    assert shown <= 4
+
+
+@pytest.mark.parametrize("latency", [0, 2])
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_a_sensor_read_once_a_period_waits(latency: int, rows: int, tmp_path: Path) -> None:
+    """However many rows lie in a period, the policy of `Delayed(task, 2)` is for a log of that task.
+
+    Between two readings the rows repeat the newest, so that an effect shows a period after its command and not a row.
+    """
+    env, random = Delayed(make("Pendulum-v1").unwrapped, latency), np.random.default_rng(0)
+    obs, _ = env.reset(seed=0)
+    commands, seen = random.uniform(-2, 2, (600, 1)), []
+    for command in commands:
+        seen.append(obs[2])
+        obs, *_ = env.step(command)
+    table = {"command": np.repeat(commands[:, 0], rows), "obs": np.repeat(seen, rows)}
+    table["time"] = 0.04 / rows * np.arange(600 * rows)
+    found = from_log(write(tmp_path / "log.csv", table), period=0.04)
+    assert found.in_step == str(latency)
+    assert found.delay == pytest.approx(0.04 * latency + found.wait)
+    assert found.wait == pytest.approx(0.04 - 0.04 / rows)
+    low, high = (int(n) for n in found.train_with.removeprefix("episode:").split(":"))
+    assert low <= latency < high
+
+
+def test_a_coarse_encoder_is_no_sensor_that_waits(tmp_path: Path) -> None:
+    """It repeats rows while it moves slowly, and not at others."""
+    u, y = signals("servo", 4)
+    steps = np.round(y / y.std() * 5)
+    found = from_log(log(tmp_path / "log.csv", u, steps), period=4 * ROW)
+    assert (found.wait, found.step) == (0, 1)
 
 
 def test_a_slow_camera_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

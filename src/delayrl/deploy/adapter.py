@@ -214,8 +214,13 @@ def stable_baselines_layers(model: Any) -> list[tuple[NDArray[np.float32], NDArr
     """Return the layers of the actor of a SAC, TD3 or DDPG of Stable-Baselines3, for `export_layers`.
 
     Raises:
-        DelayRLError: a model without an actor of its own, such as PPO, whose policy no bundle can hold.
+        DelayRLError: a model without an actor of its own, such as PPO, whose policy no bundle can hold; one whose
+            observations VecNormalize normalises.
     """
+    normalising = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if normalising is not None and normalising.norm_obs:  # `predict` takes what it has normalised, and hides it so
+        ways = "train with VecNormalize(norm_obs=False), or give adapt a function that calls its normalize_obs"
+        raise DelayRLError(f"VecNormalize normalises this model's observations, which no bundle does: {ways}")
     actor = getattr(getattr(model, "policy", None), "actor", None)
     if actor is None:
         name = type(model).__name__

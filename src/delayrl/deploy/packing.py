@@ -19,15 +19,24 @@ SAMPLES, TOLERANCE = 200, 1e-3
 """Inputs on which a network is compared with the policy that it is of, and its largest error, of the actions' range."""
 
 
-def check_same(network: Network, arrays: Arrays, policy: Callable[..., NDArray[Any]], otherwise: str) -> None:
+def check_same(
+    network: Network,
+    arrays: Arrays,
+    policy: Callable[..., NDArray[Any]],
+    otherwise: str,
+    usual: tuple[NDArray[Any], NDArray[Any]] | None = None,
+) -> None:
     """Raise DelayRLError, which begins with `otherwise`, unless the network acts as the policy, at ages from 0 to Δ.
 
-    `policy` takes the newest observation [S], the actions since [Δ, A] and the age, as a bundle does.
+    `policy` takes the newest observation [S], the actions since [Δ, A] and the age, as a bundle does. `usual` are mean
+    and deviation of its observations, both [S], if they are known: half of those here are like them.
     """
     act, random = numpy_policy(network, arrays), np.random.default_rng(0)
     low, high = np.asarray(network.low), np.asarray(network.high)
-    for age in np.linspace(0, network.max_age, SAMPLES).round().astype(int).tolist():
+    for number, age in enumerate(np.linspace(0, network.max_age, SAMPLES).round().astype(int).tolist()):
         obs = (random.normal(size=network.obs_size) * random.choice([0.1, 1.0])).astype(np.float32)
+        if usual is not None and number % 2:
+            obs = (usual[0] + usual[1] * obs).astype(np.float32)
         actions = np.zeros((network.max_age, network.action_size), np.float32)
         actions[:age] = random.uniform(low, high, (age, network.action_size))
         error = float(np.max(np.abs(act(obs, actions, age) - policy(obs, actions, age)) / (high - low)))

@@ -99,7 +99,8 @@ def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, int]:
     for i, lag in enumerate(lags):
         lagged = np.zeros((rows, u.shape[1]))
         lagged[lag:] = u[: rows - lag]
-        sums[:, i] = lagged.reshape(count, size, -1).transpose(0, 2, 1) @ target
+        # fewer rows have a product at a long lag: with equal weights the far lags would look as if chance were rarer
+        sums[:, i] = lagged.reshape(count, size, -1).transpose(0, 2, 1) @ target * (rows / (rows - lag)) ** 0.5
     return sums, size
 
 

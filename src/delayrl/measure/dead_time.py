@@ -43,9 +43,10 @@ def by_correlation(
     windows = _windows(sums, size, lags, min(WINDOWS, rows // WINDOW_ROWS), row, warm)
     pairs, r = _pairs(log, commands, observations, episode, lags, row)
     strength = correlate.strength(correlation)[0]
-    delay, steps = (first - 1) * row, tuple(rounded_up_steps(d, period) for _, d in windows)
+    renewed, wait = _renewed(observations, episode, row, period)
+    delay, steps = (first - 1) * row, tuple(rounded_up_steps(d - wait, period) for _, d in windows)
     spread = [d for _, d in windows] if len(windows) > 1 else [delay]
-    fewest, most = np.quantile([rounded_up_steps(d, period) for d in spread], (0.1, 0.9), method="nearest")
+    fewest, most = np.quantile([rounded_up_steps(d - wait, period) for d in spread], (0.1, 0.9), method="nearest")
     shortest, slowest = np.quantile(spread, (0.1, 0.9))
     return Estimated(
         method="correlation",
@@ -58,13 +59,14 @@ def by_correlation(
         rows=rows,
         warm_up=warm,
         steps=steps,
-        step=rounded_up_steps(delay, period),
+        step=rounded_up_steps(delay - wait, period),
         span=(float(shortest), float(slowest) + row),
         step_span=(int(fewest), int(most)),
         strength=float(strength.max()),
         peak=pairs[0],
         pairs=pairs[:10],
-        renewed=_renewed(observations, episode) * row,
+        renewed=renewed,
+        wait=wait,
         windows=windows,
         longest=max([delay, *(d for _, d in windows)]),
         curve=tuple((lag * row, float(strength[lag]), float(r[lag])) for lag in range(lags)),
@@ -106,10 +108,14 @@ def _windows(sums: Array, size: int, lags: int, count: int, row: float, warm: fl
     return tuple(windows)
 
 
-def _renewed(observations: Array, episode: Array) -> float:
-    """Return how many rows lie between two changes of the observation, the median."""
+def _renewed(observations: Array, episode: Array, row: float, period: float) -> tuple[float, float]:
+    """Return the time between two changes of the observation, the median, and the `Estimated.wait` that follows.
+
+    For the wait, nine of ten changes must be as far apart: a coarse encoder that moves slowly repeats some rows too.
+    """
     changed = (observations[1:] != observations[:-1]).any(1) | (episode[1:] != episode[:-1])
-    return float(np.median(np.diff(np.flatnonzero(changed)))) if changed.sum() > 1 else 1.0
+    gaps = np.diff(np.flatnonzero(changed)) * row if changed.sum() > 1 else np.array([row])
+    return float(np.median(gaps)), max(0.0, min(float(np.quantile(gaps, 0.1)), period) - row)
 
 
 def _pairs(

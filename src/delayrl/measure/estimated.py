@@ -5,8 +5,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from delayrl.delays import PerEpisode, any_phase, uniform
 from delayrl.errors import DelayRLError
 from delayrl.measure import ages
@@ -42,13 +40,14 @@ class Estimated:
     rows: int  # how many were used
     warm_up: float  # seconds left out at the start
     steps: tuple[int, ...]  # the delay of each window or observation, in steps, in order of time
-    step: int  # `delay` in steps
+    step: int  # `delay` without `wait` in steps
     span: tuple[float, float]  # the shortest and the longest delay to train for, in seconds; see `train_with`
     step_span: tuple[int, int]  # the same for a sensor in step with the loop, in steps; see `in_step`
     strength: float | None = None  # of the strongest lag; chance reaches 1 in one of a thousand logs
     peak: Pair | None = None  # largest correlation of increments; its lag includes the plant's own lag
     pairs: tuple[Pair, ...] = ()  # the strongest pairs
     renewed: float | None = None  # correlation only: seconds between two changes of the observation, the median
+    wait: float = 0.0  # seconds of `delay` that a sensor read once a period waits, beyond the row of a continuous one
     windows: tuple[tuple[float, float], ...] = ()  # (middle in seconds, dead time) of each part that shows one
     replay: tuple[tuple[int, int], ...] = ()  # stamps only: what `save` writes, see `ages.replay`
     echoes: tuple[str, ...] = ()  # correlation only: observations that repeat a command
@@ -62,11 +61,12 @@ class Estimated:
         """The argument for `delayrl train --delay`, for a sensor at any phase of the control loop.
 
         With stamps it covers the smallest delay to the 99th percentile of the ages that observations reach before the
-        next one arrives, so lost ones count. By correlation it covers the dead time, which is known to a row, or the
-        10th to the 90th percentile of windows that differ, for a sensor with the period of the loop. The law is of each
-        episode, or of each message if ages vary within one.
+        next one arrives, so lost ones count. By correlation it covers the dead time, which is known to a row and has up
+        to `wait` in it, or the 10th to the 90th percentile of windows that differ, for a sensor with the period of the
+        loop. The law is of each episode, or of each message if ages vary within one.
         """
-        (low, high), period = np.array(self.span) / self.period, float(self.method != "stamps")  # theirs include it
+        period = float(self.method != "stamps")  # theirs include it
+        low, high = max(0.0, self.span[0] - self.wait) / self.period, self.span[1] / self.period
         return self._law(*any_phase(low, high, period), self._varies)
 
     @property
