@@ -255,7 +255,7 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train vdpo --env Reacher-v5 --hidden 32,wide", "--hidden: must be a whole number; got 'wide'"),
         ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
         ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
-        ("bench run first --wrokers 2", "unexpected '--wrokers 2' (see"),
+        ("bench run first --wrokers 2", "unexpected '--wrokers 2'; did you mean --workers"),
         ("evaluate run --episode-count 2", "did you mean --episodes"),
         ("evaluate nowhere", "not a run folder"),
         ("evaluate nowhere --episods 3", "did you mean --episodes"),

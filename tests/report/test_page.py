@@ -155,6 +155,36 @@ def test_page_rounds_once(opened: Any) -> None:
     assert "3,406 ± 0" in view.locator("#all").inner_text()
 
 
+def test_page_keeps_each_seed_within_its_picture(opened: Any) -> None:
+    """One far above the others leaves their mean ± std, and must not leave the chart."""
+    cells = small(seeds=5)
+    every = anchored(cells, vdpo=[[0.0, 0, 9000], *([[0.0, 0, 60]] * 4)])
+    view = opened(summarise(every, [*cells.values()]))
+    view.locator("#curves button", has_text="each seed").click()
+    assert view.evaluate("document.activeElement.textContent") == "each seed"  # the focus stays
+    drawn = [line.get_attribute("points").split() for line in view.locator("#curves svg polyline").all()]
+    assert min(float(point.split(",")[1]) for line in drawn for point in line) >= 0
+
+
+def test_page_sorts_costs_by_size_and_keeps_the_order(opened: Any) -> None:
+    cells = small() | {name: standing(name, "delayrl/Ant-v4", 5, 2, steps=300) for name in ("bpql", "a-sac")}
+    every = anchored(cells, **{name: [[0.0, 0, 60]] * 2 for name in ("vdpo", "bpql", "a-sac")})
+    configs = [
+        cells[name][0].condition.columns
+        | {"cell": cells[name][0].id, "configuration": name, "schedule": {"steps": 300}, "hyperparameters": {}}
+        | {"cost": {"parameters": 9, "gradient_steps": {"a": 1.0}, "batches": [8], "flops": flops}}
+        for name, flops in (("vdpo", 1.4e9), ("bpql", 3e8), ("a-sac", 2e3))
+    ]
+    named = [row | {"configuration": row["agent"]} for row in every]
+    view = opened(summarise(named, [*cells.values()], configs))
+    view.locator("#cost-table button", has_text="FLOP").click()
+    assert column(view, "cost-table", 5) == ["2k", "300M", "1.4G"]
+    view.locator("#filter-agent .chip", has_text="bpql").click()
+    assert column(view, "cost-table", 5) == ["300M"]
+    view.locator("#filter-agent .chip", has_text="bpql").click()
+    assert column(view, "cost-table", 5) == ["2k", "300M", "1.4G"]
+
+
 def test_page_draws_the_curve_of_a_longer_reference_as_far_as_the_learners(opened: Any) -> None:
     cells, every = longer_reference()
     view = opened(summarise(every, cells))

@@ -1,10 +1,12 @@
 """A condition is resolved once: the same whatever the user wrote, and the same when it is read back."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import pytest
 
+from delayrl.agents.any_age import AnyAge
+from delayrl.agents.lifting import Lifting
 from delayrl.core.replay import ALL
 from delayrl.core.types import Spec
 from delayrl.delays import Constant, Delay
@@ -28,6 +30,48 @@ def test_the_id_is_of_everything_that_decides_a_result() -> None:
     changed = [resolve(*(value if i == at else given for i, given in enumerate(base))) for at, value in others]
     ids = [setup.cell_id([0]) for setup in (resolve(*base), *changed)] + [resolve(*base).cell_id([0, 1])]
     assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize("preset", ["small", "paper"])
+def test_what_a_user_gives_is_never_scaled(preset: str) -> None:
+    """Neither by name nor in an instance; a preset's own numbers follow the length of the run."""
+    values = {"lifting_hold": 2000, "lifting_end": 6000}
+    given = resolve(Lifting(**values), "Pendulum-v1", 5, preset, "corrected", {"steps": 30_000}).agent
+    named = resolve("lifting", "Pendulum-v1", 5, preset, "corrected", {"steps": 30_000, **values}).agent
+    assert [(agent.lifting_hold, agent.lifting_end) for agent in (given, named)] == [(2000, 6000)] * 2
+    usual = resolve(Lifting, "Pendulum-v1", 5, preset, "corrected", {"steps": 30_000})
+    assert usual.agent == resolve("lifting", "Pendulum-v1", 5, preset, "corrected", {"steps": 30_000}).agent
+    assert usual.agent.lifting_end < 30_000
+
+
+def test_agents_in_fields_are_told_the_length_of_the_run() -> None:
+    held = Holds(AnyAge(pull_weight=1.0, second_age="random"))
+    assert resolve(held, "Pendulum-v1", 5, "small", "corrected", {"steps": 700}).agent.inner.run_steps == 700
+    with pytest.raises(DelayRLError, match="pull_weight needs a younger second_age"):
+        resolve(Holds(AnyAge(pull_weight=1.0, second_age="none")), "Pendulum-v1", 5, "small", "corrected", {})
+
+
+@dataclass(frozen=True)
+class Holds:
+    """An agent of a user that leaves all to another."""
+
+    inner: AnyAge = field(default_factory=AnyAge)
+    privileged = False
+
+    def ahead(self, spec):
+        return self.inner.ahead(spec)
+
+    def phases(self):
+        return self.inner.phases()
+
+    def init(self, spec, key):
+        return self.inner.init(spec, key)
+
+    def act(self, state, seen, key, *, explore):
+        return self.inner.act(state, seen, key, explore=explore)
+
+    def deterministic(self, state):
+        return self.inner.deterministic(state)
 
 
 def test_json_round_trip() -> None:

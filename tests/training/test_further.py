@@ -22,6 +22,7 @@ from delayrl.cli.main import main
 from delayrl.core.types import Spec
 from delayrl.play.run import Run
 from delayrl.run.arrays import Arrays, flatten_tree
+from delayrl.run.configuration import override
 from delayrl.run.folder import versions_in
 from delayrl.training.origin import RENAMED, _renamed, fitting, parts_of, taken_over
 from random_states import random_state
@@ -386,6 +387,17 @@ def test_agents_begin_with_what_fits(old: str, new: str, taken: str, pairs: dict
         assert names
         for name in names:
             np.testing.assert_array_equal(begun[name], stored[origin + name.removeprefix(part)])
+
+
+def test_the_deviation_of_a_forecast_comes_with_its_networks_alone() -> None:
+    """It has the task's size in any network, and says nothing of another one."""
+    agent = TINY["any-age"]
+    wider = override(agent, {"hidden": [9, 9]})
+    with pytest.raises(delayrl.DelayRLError, match="has no network that fits"):
+        began(agent, wider)
+    stored, begun, note = began(agent, agent)
+    assert note.startswith("taken over: actor, actor.forecast, actor.policy, critic")
+    np.testing.assert_array_equal(begun["actor.deviation"], stored["actor.deviation"])
 
 
 @pytest.mark.parametrize(("old", "new"), [("a-sac", "vdpo"), ("sac", "dcac")])

@@ -13,6 +13,7 @@ from delayrl.cli.main import main
 from delayrl.play.evaluation import RANDOM_ACTIONS, TRAINING, reset_seed
 from delayrl.play.policy import Policy
 from delayrl.play.run import Run
+from delayrl.run.folder import RunFolder
 from short_runs import assert_same_networks, killed_and_resumed, newest, train
 
 
@@ -221,6 +222,28 @@ def test_compare(vdpo: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr().err == "delayrl: compare takes two to 8 runs; got 1\n"
     main(["compare", str(vdpo.path), str(vdpo.path), "--out", str(tmp_path / "same.png")])
     assert "all options  the same  the same" in capsys.readouterr().out
+
+
+def test_compare_says_what_is_not_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of several seeds the last evaluation is the last that all have; without one they stand alone."""
+    train("random", tmp_path / "two", steps=300, seeds=2)
+    rows = RunFolder(tmp_path / "two" / "seed1").read("rows")
+
+    def keep(steps: set[int]) -> None:
+        kept = "".join(json.dumps(row) + "\n" for row in rows if row["step"] in steps)
+        (tmp_path / "two" / "seed1" / "rows.jsonl").write_text(kept)
+
+    keep({100, 200})
+    words = ["compare", str(tmp_path / "two"), str(tmp_path / "two" / "seed0"), "--out", str(tmp_path / "x.png")]
+    main(words)
+    shown = {line.split()[0]: line.split()[1:5] for line in capsys.readouterr().out.splitlines() if line}
+    assert shown["A"] == ["200", "of", "300", "2"]
+    assert shown["B"][:2] == ["300", "1"]
+    first = (tmp_path / "two" / "seed0" / "rows.jsonl").read_text().splitlines()
+    (tmp_path / "two" / "seed0" / "rows.jsonl").write_text("\n".join(x for x in first if '"step": 300' in x) + "\n")
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "no evaluation at a common step; name runs alone" in capsys.readouterr().err
 
 
 def test_compare_does_not_pool_other_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,6 +67,10 @@ class NormalisedObservations:
         size = (spec.obs_size,)
         return State(self.agent.init(spec, key), Moments(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size)))
 
+    def usual(self, state: State) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
+        """Return mean and deviation of the states that it has learned from."""
+        return state.moments.mean, _deviation(state.moments)
+
     def act(self, state: State, seen: Seen, key: Key, *, explore: bool) -> Action:
         """Let the inner agent act on the normalised observation (and truth)."""
         truth = None if seen.truth is None else normalise(state.moments, seen.truth)
@@ -87,7 +91,7 @@ class NormalisedObservations:
             if networks.forecast is None:
                 return networks
             *layers, last = _folded(networks.forecast, moments)
-            unscaled = {name: part * deviations(moments) for name, part in last.items()}  # changes in the task's units
+            unscaled = {name: part * _deviation(moments) for name, part in last.items()}  # changes in the task's units
             return networks._replace(forecast=[*layers, unscaled])
         encoder = networks.encoder | {"obs": _folded([networks.encoder["obs"]], moments)[0]}
         return networks._replace(encoder=encoder, current=current)
@@ -114,11 +118,10 @@ def merged(moments: Moments, states: Float[Array, "batch obs"]) -> Moments:
 
 def normalise(moments: Moments, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
     """Return observations in deviations from the mean; as they are where nothing has been learned from yet."""
-    return (obs - moments.mean) / deviations(moments)
+    return (obs - moments.mean) / _deviation(moments)
 
 
-def deviations(moments: Moments) -> Float[Array, " obs"]:
-    """Return the standard deviation of each entry, at least LEAST_DEVIATION; 1 where nothing has been learned from."""
+def _deviation(moments: Moments) -> Float[Array, " obs"]:
     known = jnp.sqrt(moments.squares / jnp.maximum(moments.number, 1))
     return jnp.where(moments.number > 0, jnp.maximum(known, LEAST_DEVIATION), 1.0)
 
@@ -126,6 +129,6 @@ def deviations(moments: Moments) -> Float[Array, " obs"]:
 def _folded(layers: Params, moments: Moments) -> Params:
     """Return an `mlp` that takes observations as they are: the first rows of its first layer read them."""
     first, *rest = layers
-    rows = first["w"][: len(moments.mean)] / deviations(moments)[:, None]
+    rows = first["w"][: len(moments.mean)] / _deviation(moments)[:, None]
     weights = jnp.concatenate([rows, first["w"][len(moments.mean) :]])
     return [first | {"w": weights, "b": first["b"] - moments.mean @ rows}, *rest]

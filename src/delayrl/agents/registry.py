@@ -30,6 +30,7 @@ class Registration(NamedTuple):
     paper: str
     presets: dict[str, Preset]
     official: Protocol = OFFICIAL
+    given: bool = False  # whether all presets hold one instance of a user's, whose values are never scaled
 
     def protocol(self, name: str) -> Protocol:
         """Return the protocol called `name`. Raises DelayRLError if there is none."""

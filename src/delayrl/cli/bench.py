@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     run = add_command("run", "run a grid; the same command resumes it")
     run.set_defaults(**BACKEND_OPTIONS["slurm"], **BACKEND_OPTIONS["ray"])
     add = run.add_argument
-    add("--cells", nargs="+", metavar="ID", help="only these cells")
+    add("--cells", nargs="+", action="extend", metavar="ID", help="only these cells")
     add("--backend", choices=["local", "slurm", "ray"], default="local", help="(default: local)")
     add("--workers", type=positive, metavar="N", help="cells at a time (default: one a core, or one with a GPU)")
     add("--time-limit", type=time_limit, metavar="TIME", help="stop at a checkpoint after, e.g., 9m or 1h30m")

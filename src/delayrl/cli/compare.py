@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
+from delayrl.run.rows import number_in_words
 
 if TYPE_CHECKING:
     from delayrl.play.plots import Line
@@ -37,6 +38,7 @@ def run(given: argparse.Namespace) -> None:
     groups = [_seeds(path) for path in given.runs]
     configs = [group[0].config | {"delay": group[0].delay} for group in groups]
     learned = [_curve(group) for group in groups]  # what cannot be read is refused before anything is printed
+    ends = [config["schedule"]["steps"] for config in configs]
     labels = LABELS[: len(groups)]
     for label, path, group in zip(labels, given.runs, groups, strict=True):
         print(f"{label}  {path}" + (f" ({len(group)} seeds)" if len(group) > 1 else ""))
@@ -47,7 +49,7 @@ def run(given: argparse.Namespace) -> None:
         for label, config, curve in zip(labels, configs, learned, strict=True)
     ]
     print()
-    _print_returns(labels, lines)
+    _print_returns(labels, lines, ends)
     curves(lines, given.out, configs[0]["env"] if len({config["env"] for config in configs}) == 1 else "")
     print(f"{given.out}: learning curves")
 
@@ -72,20 +74,26 @@ def _curve(group: Sequence["Run"]) -> tuple[NDArray[Any], NDArray[Any]]:
     steps, returns = common_steps(means)
     if not len(steps):
         path = group[0].path.parent if len(group) > 1 else group[0].path
+        if all(means):
+            raise DelayRLError(f"the seeds in {path} have no evaluation at a common step; name runs alone")
         raise DelayRLError(f"{path} has no whole evaluation: it has just begun, or its rows are lost")
     return steps, returns
 
 
-def _print_returns(labels: str, lines: Sequence["Line"]) -> None:
-    """Print the last and the mean return of each line, with intervals where there are several seeds."""
+def _print_returns(labels: str, lines: Sequence["Line"], ends: Sequence[int]) -> None:
+    """Print the last and the mean return of each line, with intervals where there are several seeds.
+
+    `ends` are the steps of complete runs. Of several seeds the last evaluation is the last that all of them have.
+    """
     from delayrl.report.statistics import FEWEST, area, mean_interval
 
     rows = []
-    for label, (_, steps, returns) in zip(labels, lines, strict=True):
-        cells = [label, f"{int(steps[-1]):,}", len(returns)]
+    for label, (_, steps, returns), end in zip(labels, lines, ends, strict=True):
+        cells = [label, f"{int(steps[-1]):,}" + (f" of {end:,}" if steps[-1] < end else ""), len(returns)]
         for values in (returns[:, -1], area(steps, returns)):
-            interval = " [{:,.1f}, {:,.1f}]".format(*mean_interval(values)) if len(values) > 1 else ""
-            cells.append(f"{values.mean():,.1f}{interval}")
+            mean, bounds = float(values.mean()), mean_interval(values) if len(values) > 1 else ()
+            interval = f" [{', '.join(number_in_words(bound, mean) for bound in bounds)}]" if bounds else ""
+            cells.append(number_in_words(mean) + interval)
         rows.append(cells)
     print_table(["", "steps", "seeds", "last return", "mean over training"], rows)
     if seeds := [len(returns) for _, _, returns in lines if len(returns) > 1]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from delayrl.cli.console import add_env_kwargs, add_stored, print_table, say_unfinished, whole
 from delayrl.errors import DelayRLError
-from delayrl.run.rows import return_in_words
+from delayrl.run.rows import number_in_words, return_in_words
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def run(given: argparse.Namespace) -> None:
     if given.json:
         print(json.dumps(result))
     else:
-        returns, lowest = result["returns"], f"the lowest {min(result['returns']):.1f}"
+        returns, lowest = result["returns"], f"the lowest {number_in_words(min(result['returns']), comma='')}"
         about = f"{result['agent']} on {result['env']}, delay {result['delay']}"
         print(f"{about}: return {return_in_words(returns)}, {lowest}")
     say_unfinished(given.run, result["step"])
@@ -60,7 +60,7 @@ def _sweep(given: argparse.Namespace, stored: dict[str, Any]) -> None:
         rows = []
         for r in results:
             values = (r["mean_return"], r["std_return"], min(r["returns"]))
-            numbers = ("" if value is None else f"{value:.1f}" for value in values)
+            numbers = ("" if value is None else number_in_words(value, comma="") for value in values)
             rows.append([r["delay"], "yes" if r["learned"] else "no", *numbers, r["episodes"]])
         print_table(["delay", "learned", "mean return", "std", "lowest", "episodes"], rows)
     say_unfinished(given.run, results[0]["step"])

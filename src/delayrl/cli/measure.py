@@ -42,8 +42,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     words = "control period, e.g. 20ms or 50Hz (default: the spacing of the rows)"
     add("--period", type=seconds, metavar="TIME", help=words)
     add("--time", metavar="NAME", help="column of the time stamps (default: time, timestamp or t)")
-    add("--commands", metavar="NAME", nargs="+", help="columns, or how they begin (default: command, cmd, action)")
-    add("--observations", metavar="NAME", nargs="+", help="columns, or how they begin (default: observation, obs)")
+    add(
+        "--commands",
+        metavar="NAME",
+        nargs="+",
+        action="extend",
+        help="columns, or how they begin (default: command, cmd, action)",
+    )
+    add(
+        "--observations",
+        metavar="NAME",
+        nargs="+",
+        action="extend",
+        help="columns, or how they begin (default: observation, obs)",
+    )
     add("--episode", metavar="NAME", help="column that changes where a new recording begins")
     add("--stamp", metavar="NAME", help="column of the time when an observation was made (default: stamp)")
     add("--received", metavar="NAME", help="column of the time when it arrived (default: received)")

@@ -9,6 +9,7 @@ from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
 from delayrl.play.run import Run, runs
 from delayrl.run.checkpoint import checkpoint_folders
+from delayrl.run.rows import number_in_words
 
 NAMES = ("agent", "preset", "env", "delay", "seed")
 
@@ -49,5 +50,5 @@ def _cells(row: dict[str, Any]) -> list[Any]:
     if row["error"]:
         return [*["-"] * (len(NAMES) + 2), row["error"]]  # which names the folder
     steps = f"{row['step']:,}" if row["step"] >= row["steps"] else f"{row['step']:,} of {row['steps']:,}"
-    last = "-" if row["return"] is None else f"{row['return']:,.1f}"
+    last = "-" if row["return"] is None else number_in_words(row["return"])
     return [*(row[name] for name in NAMES), steps, last, row["run"]]

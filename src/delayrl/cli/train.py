@@ -32,7 +32,7 @@ def add_options(parser: Parser, words: Sequence[str]) -> None:
     agent = find_agent(words[0])
     parser.prog, parser.description = f"delayrl train {words[0]}", agent.summary
     parser.allow_abbrev = False
-    first = Parser(prog=parser.prog, add_help=False)
+    first = Parser(prog=parser.prog, add_help=False, allow_abbrev=False)
     usual = "paper" if "paper" in agent.presets else next(iter(agent.presets))
     first.add_argument("--preset", choices=list(agent.presets), default=usual)
     preset = first.parse_known_args(words)[0].preset

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from delayrl.cli.console import add_env_kwargs, add_stored, say_unfinished, whole
+from delayrl.run.rows import number_in_words
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +29,9 @@ def run(given: argparse.Namespace) -> None:
     shown = (given.delay, given.seed, given.camera, given.compare, given.seconds)
     moments = watch(given.run, given.out, *shown, **stored)
     several = "" if given.seconds is None else "episode {0.episode}, "
-    results = (several.format(moment) + f"{moment.step:,} steps, return {moment.total:,.1f}" for moment in moments)
+    results = (
+        several.format(moment) + f"{moment.step:,} steps, return {number_in_words(moment.total)}" for moment in moments
+    )
     print(f"{given.out}: {'; beside it '.join(results)}")
     for folder in filter(None, (given.run, given.compare)):
         say_unfinished(folder)

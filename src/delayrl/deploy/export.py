@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from delayrl.agents.normalised import NormalisedObservations, deviations
 from delayrl.deploy.backends.network import Arrays, Network
 from delayrl.deploy.files import check_target, write_files
 from delayrl.deploy.packing import check_same, pack, space_json
@@ -56,9 +55,10 @@ def export_run(
     first = np.zeros(network.obs_size), np.zeros((network.max_age, network.action_size)), 0
     if np.array_equal(act(*first), act(*first)):  # else it samples in evaluation, and its network gives the mode
         otherwise, usual = f"{config['agent']}: its `deterministic` does not give the actions of its `act`", None
-        if isinstance(policy.agent, NormalisedObservations):
+        if (known := getattr(policy.agent, "usual", None)) is not None:
             otherwise = "its network reads observations whose mean is too large for their deviation: subtract it before"
-            usual = np.asarray(policy.state.moments.mean), np.asarray(deviations(policy.state.moments))
+            mean, spread = known(policy.state)
+            usual = np.asarray(mean), np.asarray(spread)
         check_same(network, arrays, act, otherwise, usual)
     write_files(Path(out), pack(network, arrays, metadata), force=force)
     return metadata

@@ -16,7 +16,7 @@ from delayrl.run.rows import CONDITION, CONFIGURATION, Row, name_configuration, 
 from delayrl.run.stored import condition_of
 
 LIMIT = 2**53  # the page holds numbers as doubles, which are exact below
-LARGEST = 1e300  # return; sums stay finite
+LARGEST = 1e150  # return; sums and squares stay finite
 
 
 Key = tuple[Any, ...]

@@ -14,6 +14,7 @@ from delayrl.report.summary import Aggregate, Summary
 from delayrl.report.tables import Table, TableEntry
 from delayrl.run.cell import CellState
 from delayrl.run.cost import Cost
+from delayrl.run.rows import number_in_words, unsigned_zero
 
 PAPER = (
     "Paper: Wu et al., Variational Delayed Policy Optimization, NeurIPS 2024; 10 seeds, 1,000,000 steps. It states no "
@@ -26,17 +27,19 @@ def number(value: float, like: float | None = None) -> str:
     if math.isnan(value):
         return ""
     size = abs(value if like is None else like)
-    return f"{value:,.0f}" if size >= 1000 else f"{value:,.1f}" if size >= 10 else f"{value:,.2f}"
+    return number_in_words(value, like, least=0 if size >= 1000 else 1 if size >= 10 else 2)
 
 
 def normalised(value: float) -> str:
-    """Write a normalised return."""
-    return f"{value:.2f}"
+    """Write a normalised return; 0.00 has no sign."""
+    return unsigned_zero(f"{value:.2f}")
 
 
 def steps(value: float) -> str:
-    """Write environment steps, large numbers in millions as the paper does."""
-    return "" if math.isnan(value) else f"{value / 1e6:.2f}M" if value >= 1e5 else f"{value:,.0f}"
+    """Write environment steps, large numbers in millions as the paper does, with a third decimal where there is one."""
+    if math.isnan(value) or value < 1e5:
+        return "" if math.isnan(value) else f"{value:,.0f}"
+    return f"{value / 1e6:.3f}".removesuffix("0") + "M"
 
 
 def spread(value: float, std: float, write: Callable[[float], str] | None = None) -> str:

@@ -158,9 +158,18 @@ def warn_of_other_code(config: Mapping[str, Any], folder: Path, agent: Agent) ->
 
 def as_trained(agent: Agent, schedule: Schedule) -> Agent:
     """Return an agent as a run with this schedule trains and plays it."""
-    if for_run := getattr(agent, "for_run", None):
-        agent = for_run(schedule)
+    agent = _for_run(agent, schedule)
     return NormalisedObservations(agent) if schedule.observation_norm == "running" else agent
+
+
+def _for_run(agent: Any, schedule: Schedule) -> Any:
+    """Return an agent for a run of this schedule, with those that it holds in fields."""
+    for field in fields(agent):
+        held = getattr(agent, field.name)
+        if field.init and is_dataclass(held) and (made := _for_run(held, schedule)) is not held:
+            agent = replace(agent, **{field.name: made})
+    for_run = getattr(agent, "for_run", None)
+    return agent if for_run is None else for_run(schedule)
 
 
 def agent_names() -> list[str]:
@@ -217,7 +226,7 @@ def _entry(given: Any, made: Agent) -> Registration:
     If its class derives from one of ours, its protocols are that agent's. If it is given as a class, without values,
     its presets are that agent's too, as far as it takes their values.
     """
-    own = registered(_summary(made), made)
+    own = registered(_summary(made), made)._replace(given=not isinstance(given, type))
     ours = next(filter(None, map(_agent_with_defaults_of, type(made).__mro__)), None)
     if ours is None:
         return own

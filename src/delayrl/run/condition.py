@@ -132,7 +132,8 @@ def resolve(
     check_not_taken(name, base.agent)
     check_names(overrides, base.agent, base.schedule)
     values = {**chosen.overrides, **overrides}
-    values = following(preset, base, override(base.schedule, values).steps) | values
+    steps = override(base.schedule, values).steps
+    values = following(preset, base, steps, scaled=not registration.given) | values
     schedule = override(base.schedule, values)
     task = as_task(env)
     parsed = delay_of(task, delay)
@@ -150,9 +151,9 @@ def resolve(
     return Setup(condition, task, made, schedule, parsed, chosen, {k: _digest(x) for k, x in unnamed.items() if x})
 
 
-def following(name: str, preset: Preset, steps: int) -> dict[str, int]:
-    """Return the options of the preset called `name` that are other numbers in a run of so many steps."""
+def following(name: str, preset: Preset, steps: int, *, scaled: bool = True) -> dict[str, int]:
+    """Return the options of a preset that are other numbers in a run of so many steps; the agent's only if `scaled`."""
     usual, length = {**values_of(preset.agent), **values_of(preset.schedule)}, preset.schedule.steps
-    scaled = [option.name for option in options(preset.agent) if option.scales]
-    names = (*scaled, *(GROWS.get(name, ()) if steps > length else ()))
+    own = [option.name for option in options(preset.agent) if option.scales] if scaled else []
+    names = (*own, *(GROWS.get(name, ()) if steps > length else ()))
     return {name: -(-usual[name] * steps // length) for name in names if name in usual and steps != length}

@@ -30,6 +30,9 @@ class Cost:
             steps = {str(name): float(number) for name, number in values["gradient_steps"].items()}
             batches = tuple(int(batch) for batch in values["batches"])
             flops = values["flops"]
+            numbers = [float(values["parameters"]), *steps.values(), *batches, 0.0 if flops is None else float(flops)]
+            if not all(map(math.isfinite, numbers)):
+                raise ValueError("a number is not finite")
             return cls(int(values["parameters"]), steps, batches, math.nan if flops is None else float(flops))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DelayRLError(f"no good cost: {str(values)[:100]}") from error

@@ -34,7 +34,7 @@ NAMES = {"agent": str, "preset": str, "env": str, "delay": int | str}
 CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "schedule": dict}
 """What a configuration must hold, with its types."""
 MORE: dict[str, Any] = {"versions": dict, "later_versions": list, "configuration": str, "origin": dict, "unnamed": dict}
-MORE |= {"seed": int, "protocol": str}
+MORE |= {"seed": int, "protocol": str, "hyperparameters": dict, "schedule": dict}
 """What it may hold besides."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")
@@ -285,6 +285,10 @@ def check_more(config: Mapping[str, Any], where: object) -> None:
         value = config.get(name, kind())
         if not isinstance(value, kind) or (kind is list and not all(isinstance(part, dict) for part in value)):
             raise DelayRLError(f"{where} is damaged: no good {name}: {value!r:.60}")
+    source = config.get("origin", {}).get("from", {})
+    steps = config.get("schedule", {}).get("steps", 0)
+    if not isinstance(source, dict) or type(steps) is not int:
+        raise DelayRLError(f"{where} is damaged: no good origin or steps")
 
 
 def is_config(file: Path) -> bool:

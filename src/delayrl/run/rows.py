@@ -46,10 +46,26 @@ def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float | None:
     return float(np.std(returns, ddof=1)) if np.size(returns) > 1 else None
 
 
+def number_in_words(value: float, like: float | None = None, *, least: int = 1, comma: str = ",") -> str:
+    """Write a number with at least this many decimals; below 1 with three digits, if there are any in six decimals.
+
+    `like` is another number whose decimals it gets, as a deviation gets those of its mean. A rounded 0 has no sign.
+    """
+    size = abs(value if like is None else like)
+    decimals = max(least, 2 - math.floor(math.log10(size))) if 1e-6 <= size < 1 else least
+    return unsigned_zero(f"{value:{comma}.{decimals}f}")
+
+
+def unsigned_zero(text: str) -> str:
+    """Return a number's text, without its sign if it is 0."""
+    return text.removeprefix("-") if not text.strip("-0.") else text
+
+
 def return_in_words(returns: Sequence[float] | NDArray[np.float64]) -> str:
     """Write the mean of episodes' returns, ± their standard deviation, and of how many episodes it is."""
-    spread, episodes = deviation(returns), count(np.size(returns), "episode")
-    return f"{np.mean(returns):.1f}" + (f" ± {spread:.1f}" if spread is not None else "") + f" over {episodes}"
+    mean, spread = float(np.mean(returns)), deviation(returns)
+    words = "" if spread is None else f" ± {number_in_words(spread, mean, comma='')}"
+    return f"{number_in_words(mean, comma='')}{words} over {count(np.size(returns), 'episode')}"
 
 
 def name_configuration(rows: Sequence[Row]) -> list[Row]:

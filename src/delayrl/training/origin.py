@@ -60,7 +60,7 @@ def taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) ->
     left = ", ".join(part for part in parts if part not in taken)
     if not parts:
         raise DelayRLError(f"there is no network to take over from {source.path.parents[1]}: this agent has none")
-    if not set(taken) - {"moments"}:
+    if not networks_of(fresh).intersection(taken):
         where, norms = source.path.parents[1], [_normalisation(arrays) for arrays in (stored, fresh)]
         line = f"{where} has no network that fits: it lacks {left}, or has them in other sizes"
         hint = "; its observation_norm is {}, and that of the new run {}".format(*norms) if len(set(norms)) > 1 else ""
@@ -89,7 +89,8 @@ def _renamed(stored: Arrays, old: str, new: str) -> Arrays:
 def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
     """Return the parts of an agent's state that stored arrays can fill; a lone number only beside a network.
 
-    Optimisers and counters are in no part: they are never taken over.
+    What is measured for networks, such as the deviation of a forecast's errors, comes only with all of them. Optimisers
+    and counters are in no part: they are never taken over.
     """
     parts = parts_of(fresh)
     deeper = {part_of(name) for name in stored.keys() - fresh.keys() if any(word.isdigit() for word in name.split("."))}
@@ -101,9 +102,23 @@ def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
         return part.rpartition(".")[0]
 
     taken = [part for part, names in parts.items() if part not in deeper and all(map(fits, names))]
-    numbers = {part for part in taken if part in fresh and fresh[part].ndim == 0}
-    begun = {agent_of(part) for part in taken if part not in numbers}
-    return [part for part in taken if part not in numbers or agent_of(part) in begun]
+    numbers, networks = {part for part in taken if part in fresh and fresh[part].ndim == 0}, networks_of(fresh)
+    begun = {agent_of(part) for part in networks.intersection(taken)}
+
+    def belongs(part: str) -> bool:
+        beside = {network for network in networks if network.startswith(f"{part}.")}
+        return agent_of(part) in begun if part in numbers else part in networks or beside <= {*taken}
+
+    return [part for part in taken if belongs(part)]
+
+
+def networks_of(state: Arrays) -> set[str]:
+    """Return the parts that have layers or matrices, and are not only measured, as moments of observations are."""
+
+    def learned(name: str) -> bool:
+        return state[name].ndim > 1 or any(word.isdigit() for word in name.split("."))
+
+    return {part for part, names in parts_of(state).items() if any(map(learned, names))}
 
 
 def parts_of(state: Arrays) -> dict[str, list[str]]:
