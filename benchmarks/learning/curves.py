@@ -121,7 +121,7 @@ def bold(text: str) -> str:
     if not text:
         return ""
     low, high = re.findall(r"[-+][\d,]+", text)[1:]
-    return f"**{text}**" if low[0] == high[0] and (low, high) != ("+0", "+0") else text
+    return f"**{text}**" if low[0] == high[0] and (low[1:], high[1:]) != ("0", "0") else text
 
 
 def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any) -> Line2D:

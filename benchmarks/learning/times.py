@@ -105,8 +105,8 @@ def table(runs: Runs) -> str:
 def ratio(runs: list[Run], ours: list[Run], value: float) -> str:
     """Write how many times as long as ours a side takes to a return; a dash where neither reaches it.
 
-    Where half of one's seeds do not, that is a bound: those count as if they had at their last evaluation. The other's
-    that do not count as last.
+    Where half of one's seeds do not, that is a bound: those count as if they had at their last evaluation. Seeds of
+    the other that do not reach it are the last in its median.
     """
     theirs_does, ours_does = (np.isfinite(median(some, value)[1]) for some in (runs, ours))
     if not (theirs_does or ours_does):

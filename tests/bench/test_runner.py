@@ -234,7 +234,7 @@ def test_tries_are_bounded(tmp_path: Path) -> None:
     assert [backend.started.count(agent) for agent in ("sac", "bpql", "vdpo")] == [3, 3, 1]
     assert [cell.condition.agent for cell in completion.done] == ["bpql"]
     assert completion.failed == {
-        "sac": "3 tries stored nothing new; the last: killed by SIGKILL",
+        "sac": "3 deaths, and nothing new was stored; the last: killed by SIGKILL",
         "vdpo": "discount: no",
     }
     now = standing(cells("sac", "bpql", "vdpo"), tmp_path)
@@ -316,6 +316,14 @@ def test_tries_with_progress_do_not_count(tmp_path: Path, monkeypatch) -> None:
     backend = Script(sac=[DIED] * 5 + [DONE])
     assert run_cells(cells("sac"), tmp_path, backend, tries=2).failed == {}
     assert len(backend.started) == 6
+
+
+def test_a_disk_that_answers_again_is_no_progress(tmp_path: Path, monkeypatch) -> None:
+    """While it does not answer, nothing seems to be stored; what it shows then was there before."""
+    monkeypatch.setattr("delayrl.bench.runner.RETRY", 0.01)
+    steps = iter([50, 50, 0, 50, 0, 50])
+    monkeypatch.setattr(folders, "stored", lambda *_: (next(steps), False))
+    assert run_cells(cells("sac"), tmp_path, Script(sac=[DIED] * 9), tries=3).failed
 
 
 def test_a_cell_of_another_runner_is_waited_for(tmp_path: Path) -> None:

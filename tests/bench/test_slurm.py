@@ -55,7 +55,9 @@ def test_a_signal_before_the_runner_has_begun_requeues(tmp_path: Path, monkeypat
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     env = os.environ | {"PATH": f"{tmp_path}:{PATH}", "SLURM_ARRAY_TASK_ID": "0", "SLURM_JOB_ID": "7"}
     process = subprocess.Popen(["bash", "-c", script(grid, grid.cells, tmp_path)], env=env)
-    while not begun.exists():
+    for _ in range(400):
+        if begun.exists():
+            break
         time.sleep(0.05)
     process.terminate()
     assert process.wait(20) == 143

@@ -84,7 +84,13 @@ def test_holms_correction(values: list[float], clear: list[bool]) -> None:
 
 @pytest.mark.parametrize(
     ("text", "clear"),
-    [("+9 (-1 to +19)", False), ("-9 (-19 to -1)", True), ("+9 (+1 to +1,900)", True), ("+0 (+0 to +0)", False)],
+    [
+        ("+9 (-1 to +19)", False),
+        ("-9 (-19 to -1)", True),
+        ("+9 (+1 to +1,900)", True),
+        ("-0 (-0 to -0)", False),
+        ("+3 (+0 to +6)", True),
+    ],
 )
 def test_what_leaves_out_0_is_bold(text: str, clear: bool) -> None:
     assert bold(text) == (f"**{text}**" if clear else text)

@@ -256,6 +256,7 @@ def test_help_shows_every_hyperparameter(agent: str, capsys: pytest.CaptureFixtu
         ("train vdpo --env Reacher-v5 --delay 3 --preset big", "invalid choice"),
         ("train vdpo --env Reacher-v5 --delay 3 and more", "unexpected"),
         ("bench run first --wrokers 2", "unexpected '--wrokers 2'; did you mean --workers"),
+        ("bench status first --runs run --wrokers 2", "did you mean --workers? (see `delayrl bench status"),
         ("evaluate run --episode-count 2", "did you mean --episodes"),
         ("evaluate nowhere", "not a run folder"),
         ("evaluate nowhere --episods 3", "did you mean --episodes"),

@@ -880,13 +880,22 @@ def test_command_for_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_unrelated_signals_rarely_show_a_delay() -> None:
-    """A few short logs of a thousand; 27 of a thousand when far lags were not weighed by their rows."""
+    """Few of a thousand short logs: 27 when far lags, at which fewer rows have a product, counted as the others."""
     random, episode, shown = np.random.default_rng(5), np.zeros(200), 0
-    for _ in range(600):
+    for _ in range(1000):
         u, y = correlate.innovations(random.normal(size=(200, 1)), random.normal(size=(200, 1)), episode)
-        sums, size = correlate.blocks(u, y, 20, 8)
-        shown += correlate.onset(correlate.correlation(sums, size, 20)) is not None
-    assert shown <= 4
+        shown += correlate.onset(correlate.correlation(*correlate.blocks(u, y, 20, 8), 20)) is not None
+    assert shown <= 10
+
+
+def test_chance_is_alike_at_all_lags_and_in_all_parts() -> None:
+    """N r² of white signals is 1 in the mean, in the first part of a log too, where few rows have a far product."""
+    random, found = np.random.default_rng(0), []
+    for _ in range(40):
+        sums, products = correlate.blocks(random.normal(size=(1200, 1)), random.normal(size=(1200, 1)), 100, 8)
+        parts = [correlate.correlation(sums[part], products[part], 100) for part in (slice(8), slice(3), slice(3, 8))]
+        found.append([part.rows * (r**2).mean() for part in parts for r in (part.near, part.far)])
+    np.testing.assert_allclose(np.mean(found, 0), 1, atol=0.15)
 
 
 @pytest.mark.parametrize("latency", [0, 2])

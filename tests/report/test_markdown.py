@@ -8,6 +8,7 @@ from synthetic import EVIL, nasty
 from delayrl.report import wording
 from delayrl.report.markdown import markdown
 from delayrl.report.summary import summarise
+from delayrl.run.rows import return_in_words
 
 
 @pytest.mark.parametrize(
@@ -26,6 +27,12 @@ from delayrl.report.summary import summarise
 )
 def test_numbers_have_three_digits_and_0_no_sign(value: float, text: str) -> None:
     assert wording.number(value) == text
+
+
+def test_a_mean_near_0_has_the_decimals_of_its_deviation() -> None:
+    assert wording.spread(0.02, 3000.5) == "0 ± 3,000"
+    assert wording.spread(0.02, 0.003) == "0.0200 ± 0.0030"
+    assert return_in_words([0.3, -12.5, 12.3]) == "0.0 ± 12.4 over 3 episodes"
 
 
 def test_steps_of_different_evaluations_read_apart() -> None:

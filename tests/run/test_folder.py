@@ -1,5 +1,6 @@
 """Run folders and their checkpoints: what is good stays, what is broken is named in one line."""
 
+import errno
 import json
 import os
 import re
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 from delayrl.errors import DelayRLError
-from delayrl.run.checkpoint import checkpoint_folders
-from delayrl.run.disk import lock
+from delayrl.run.checkpoint import Checkpoint, checkpoint_folders
+from delayrl.run.disk import lock, passes
 from delayrl.run.folder import RunFolder
 from short_runs import full_disk
 
@@ -81,6 +82,25 @@ def test_a_damaged_manifest_is_one_line(damage: dict, words: str, run: RunFolder
     run.drop_pieces()
     networks_are_intact = isinstance(damage.get("pieces"), dict)  # which is all that play takes
     assert run.latest().step == (200 if networks_are_intact else 100)
+
+
+@pytest.mark.parametrize(("number", "passing"), [(errno.EIO, True), (errno.EACCES, False)])
+def test_a_checkpoint_on_a_disk_that_does_not_answer_is_not_broken(
+    number: int, passing: bool, run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may be whole: a run that went on from an older one would delete it."""
+
+    def refuse(self: Checkpoint, *, replay: bool) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Checkpoint, "check", refuse)
+    if passing:
+        with pytest.raises(DelayRLError, match="cannot be read now") as error:
+            run.checkpoints()
+        assert passes(error.value)
+    else:
+        good, lines = run.checkpoints()
+        assert (good, len(lines)) == ([], 1)
 
 
 def test_a_copy_of_a_checkpoint_is_left_out(run: RunFolder) -> None:

@@ -24,7 +24,7 @@ from delayrl.play.run import Run
 from delayrl.run.arrays import Arrays, flatten_tree
 from delayrl.run.configuration import override
 from delayrl.run.folder import versions_in
-from delayrl.training.origin import RENAMED, _renamed, fitting, parts_of, taken_over
+from delayrl.training.origin import RENAMED, _renamed, fitting, measured_of, parts_of, taken_over
 from random_states import random_state
 from short_runs import SHRINK, arrays, assert_same_networks, newest, train
 
@@ -395,6 +395,14 @@ def test_the_deviation_of_a_forecast_comes_with_its_networks_alone() -> None:
     wider = override(agent, {"hidden": [9, 9]})
     with pytest.raises(delayrl.DelayRLError, match="has no network that fits"):
         began(agent, wider)
+    *_, note = began(override(agent, {"critic_norm": "none"}), agent)
+    assert (
+        note
+        == "taken over: actor, actor.forecast, actor.policy, log_temperature; new: critic, target, and the optimisers"
+    )
+    flat = {"theta": np.zeros(5)}  # an agent of a user without layers
+    assert fitting(flat, flat) == ["theta"]
+    assert not measured_of(flat)
     stored, begun, note = began(agent, agent)
     assert note.startswith("taken over: actor, actor.forecast, actor.policy, critic")
     np.testing.assert_array_equal(begun["actor.deviation"], stored["actor.deviation"])

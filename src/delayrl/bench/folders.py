@@ -55,7 +55,7 @@ def hold_cell(folder: Path) -> Iterator[None]:
 def holder(folder: Path) -> str | None:
     """Return the host and process id that hold the cell, or None."""
     file = folder / "lock"
-    with contextlib.suppress(FileNotFoundError), lock(file, shared=True) as free:
+    with contextlib.suppress(OSError), lock(file, shared=True) as free:  # there is none, or the disk does not answer
         return None if free else file.read_text().strip() or "another process"
     return None
 
@@ -87,7 +87,7 @@ def stored(folder: Path, seeds: tuple[int, ...]) -> tuple[int, bool]:
         newest = _newest_checkpoint(run)
         steps.append(newest.step if newest else 0)
         # a complete run that still has a replay was killed before it could delete it
-        complete.append(newest is not None and newest.complete and not (run / "replay").exists())
+        complete.append(newest is not None and newest.complete and not os.path.exists(run / "replay"))
     return min(steps), all(complete)
 
 

@@ -1,7 +1,7 @@
 """Run cells: which starts next, what is tried again, when to stop. A `Backend` says where they run.
 
-A worker that dies is started again and resumes from its checkpoint. Only tries in a row that store nothing new count,
-so a long cell may be interrupted any number of times. An error that would come back is not tried again.
+A worker that dies is started again and resumes from its checkpoint. Only deaths that store nothing new count, and not
+stops, so a long cell may be interrupted any number of times. An error that would come back is not tried again.
 """
 
 import contextlib
@@ -91,11 +91,13 @@ def run_cells(
             if stopped is not None and now - stopped > GRACE:
                 break
             queue.start(now)
-            for cell, outcome in backend.ended():
+            outcomes = backend.ended()
+            queue.running -= len(outcomes)
+            for cell, outcome in outcomes:
                 queue.end(cell, outcome, now)
             tick()
             time.sleep(PAUSE)
-    except Exception:  # a second Ctrl-C does not wait
+    except Exception:
         queue.let_stop()
         raise
     finally:
@@ -114,7 +116,7 @@ class _Queue:
         self._runs, self._backend, self._tries, self._say = runs, backend, tries, say
         self._stopping = False
         self._not_before = dict[str, float]()
-        self._in_vain, self._step = Counter[str](), dict[str, int]()
+        self._in_vain, self._stops, self._step = Counter[str](), Counter[str](), dict[str, int]()
 
     def add(self, cell: Cell) -> None:
         """Queue a cell, unless it is complete; if it is, and damaged, it has failed."""
@@ -149,24 +151,28 @@ class _Queue:
 
     def end(self, cell: Cell, outcome: Outcome, now: float) -> None:
         """Sort in a cell whose worker has ended: done, failed, or to be tried again."""
-        self.running -= 1
         kind, line = outcome
         step = folders.stored(self._runs / cell.folder, cell.seeds)[0]
-        in_vain = 0 if step > self._step[cell.id] or kind == "locked" else self._in_vain[cell.id] + (kind == "died")
-        self._in_vain[cell.id], self._step[cell.id] = in_vain, step
+        if step > self._step[cell.id] or kind == "locked":
+            self._in_vain[cell.id] = self._stops[cell.id] = 0
+        else:
+            self._in_vain[cell.id] += kind == "died"
+            self._stops[cell.id] += kind == "stopped"
+        step = self._step[cell.id] = max(step, self._step[cell.id])  # 0 is also what a disk that does not answer gives
+        in_vain = self._in_vain[cell.id]
         if kind == "done":
             self.completion.done.append(cell)
             self._say(f"done: {cell}")
         elif kind == "failed":
             self._fail(cell, line)
         elif kind == "died" and in_vain >= self._tries:
-            self._fail(cell, f"{self._tries} tries stored nothing new; the last: {line}")
+            self._fail(cell, f"{self._tries} deaths, and nothing new was stored; the last: {line}")
         elif self._stopping:
             self.completion.unfinished.append(cell)
         elif kind == "locked":  # another runner has it, and may leave it unfinished
             self._retry(cell, now + RETRY)
         else:
-            self._retry(cell, now + RETRY * max(in_vain, kind == "stopped"))  # what ended it may last for a while
+            self._retry(cell, now + RETRY * (in_vain + self._stops[cell.id]))  # what ended it may last for a while
             self._say(f"again from step {step:,}: {cell}: {line}")
 
     def stop(self) -> None:
@@ -177,12 +183,13 @@ class _Queue:
         self._backend.stop()
 
     def let_stop(self) -> None:
-        """Let what runs reach a checkpoint, whatever may be wrong here."""
-        self._backend.stop()
-        until = time.monotonic() + GRACE
-        while self.running > 0 and time.monotonic() < until:
-            self.running -= len(self._backend.ended())
-            time.sleep(PAUSE)
+        """Let what runs reach a checkpoint, unless the backend itself fails."""
+        with contextlib.suppress(Exception):  # the first error is the one to show
+            self._backend.stop()
+            until = time.monotonic() + GRACE
+            while self.running > 0 and time.monotonic() < until:
+                self.running -= len(self._backend.ended())
+                time.sleep(PAUSE)
 
     def _retry(self, cell: Cell, not_before: float) -> None:
         self.waiting.append(cell)

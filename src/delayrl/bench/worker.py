@@ -6,7 +6,6 @@ SIGTERM, or when the process that started it is gone: its stdin is a pipe, which
 
 import argparse
 import contextlib
-import errno
 import json
 import os
 import signal
@@ -18,10 +17,8 @@ from typing import Any, Literal, NamedTuple
 
 from delayrl.bench.folders import LockedError, hold_cell, journal, note, seed_paths, stored
 from delayrl.errors import DelayRLError, StoppedError, described
+from delayrl.run.disk import passes
 from delayrl.run.rows import CONDITION
-
-PASSING = {errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EINTR}
-"""Errors of a disk, mostly of one on a network, that another try may not meet. A full disk stays full."""
 
 Kind = Literal["done", "stopped", "failed", "died", "locked"]
 
@@ -58,13 +55,12 @@ def work(folder: Path, device: str | None = None) -> Outcome:
         return Outcome("locked", "another process works on it")
     except DelayRLError as error:
         _log(str(error))
-        passes = isinstance(error.__cause__, OSError) and error.__cause__.errno in PASSING
-        return Outcome("died" if passes else "failed", str(error))
+        return Outcome("died" if passes(error) else "failed", str(error))
     except Exception as error:
         _log(traceback.format_exc())
         # another try may find more memory or a disk that answers; JAX's errors are RuntimeErrors. A mistake stays
-        passes = isinstance(error, OSError | MemoryError | RuntimeError)
-        return Outcome("died" if passes else "failed", described(error))
+        again = isinstance(error, OSError | MemoryError | RuntimeError)
+        return Outcome("died" if again else "failed", described(error))
 
 
 def _train(folder: Path, cell: dict[str, Any], device: str | None) -> Outcome:

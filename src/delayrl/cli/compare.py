@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from delayrl.cli.console import print_table
 from delayrl.errors import DelayRLError
-from delayrl.run.rows import number_in_words
+from delayrl.run.rows import number_in_words, shown_like
 
 if TYPE_CHECKING:
     from delayrl.play.plots import Line
@@ -92,8 +92,9 @@ def _print_returns(labels: str, lines: Sequence["Line"], ends: Sequence[int]) ->
         cells = [label, f"{int(steps[-1]):,}" + (f" of {end:,}" if steps[-1] < end else ""), len(returns)]
         for values in (returns[:, -1], area(steps, returns)):
             mean, bounds = float(values.mean()), mean_interval(values) if len(values) > 1 else ()
-            interval = f" [{', '.join(number_in_words(bound, mean) for bound in bounds)}]" if bounds else ""
-            cells.append(number_in_words(mean) + interval)
+            like = shown_like(mean, *bounds)
+            interval = f" [{', '.join(number_in_words(bound, like) for bound in bounds)}]" if bounds else ""
+            cells.append(number_in_words(mean, like) + interval)
         rows.append(cells)
     print_table(["", "steps", "seeds", "last return", "mean over training"], rows)
     if seeds := [len(returns) for _, _, returns in lines if len(returns) > 1]:

@@ -30,7 +30,8 @@ class Parser(argparse.ArgumentParser):
         given, rest = self.parse_known_args([hyphenated(word) for word in words])
         if rest:
             unknown = next((word for word in rest if word.startswith("--")), "").split("=")[0]
-            inner = next((sub for sub in _subcommands(self) if sub.prog.split()[-1] in words), self)
+            groups = (action for action in self._actions if isinstance(action, argparse._SubParsersAction))
+            inner = next((group.choices.get(getattr(given, group.dest), self) for group in groups), self)
             options = [name for name in inner._option_string_actions if name not in ("-h", "--help")]
             inner.error(f"unexpected {' '.join(rest)!r}{did_you_mean(near_names(unknown, options))}")
         return given
@@ -38,11 +39,6 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise DelayRLError instead of printing the usage."""
         raise DelayRLError(f"{message.replace('argument ', '')} (see `{self.prog} --help`)")
-
-
-def _subcommands(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
-    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    return [command for group in groups for command in group.choices.values()]
 
 
 def add_env_kwargs(parser: argparse._ActionsContainer) -> None:

@@ -31,7 +31,7 @@ COMMANDS = {
 """Each command is the module of its name in this folder, with `run(given)` and, if it has options, `add_options`."""
 
 
-class _Progress:
+class _Stderr:
     """A stderr that never raises: a reader that is gone, or a full disk, ends no work that it was to be told of."""
 
     def __init__(self, stream: TextIO):
@@ -53,8 +53,8 @@ class _Progress:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that the words after `delayrl` name; None for the words of the process."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
-    if sys.stderr is not None and not isinstance(sys.stderr, _Progress):
-        sys.stderr = _Progress(sys.stderr)  # type: ignore[assignment]
+    if sys.stderr is not None and not isinstance(sys.stderr, _Stderr):
+        sys.stderr = _Stderr(sys.stderr)  # type: ignore[assignment]
     if isinstance(sys.stdout, io.TextIOWrapper):  # what a terminal, or a name in a file, cannot show is escaped
         sys.stdout.reconfigure(errors="backslashreplace")
     try:

@@ -182,7 +182,7 @@ def _show_correlation(e: Estimated) -> list[str]:
         f"{'increments correlate most':<26}{peak}",
     ]
     if e.wait > 0:
-        lines.insert(1, f"{'':<26}(up to {_ms(e.wait)} of it until the sensor is read again, once a period)")
+        lines.insert(1, f"{'':<26}(up to {_ms(e.wait)} of it until the sensor is read again)")
     if e.peak.lag >= e.delay:  # with feedback in the commands it may be earlier
         lines.append(f"{'':<26}(that is the dead time, the plant's own lag, and a row)")
     if e.echoes:

@@ -218,7 +218,7 @@ def stable_baselines_layers(model: Any) -> list[tuple[NDArray[np.float32], NDArr
             observations VecNormalize normalises.
     """
     normalising = getattr(model, "get_vec_normalize_env", lambda: None)()
-    if normalising is not None and normalising.norm_obs:  # `predict` takes what it has normalised, and hides it so
+    if normalising is not None and normalising.norm_obs:  # the comparison with `predict` cannot see it
         ways = "train with VecNormalize(norm_obs=False), or give adapt a function that calls its normalize_obs"
         raise DelayRLError(f"VecNormalize normalises this model's observations, which no bundle does: {ways}")
     actor = getattr(getattr(model, "policy", None), "actor", None)

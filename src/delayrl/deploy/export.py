@@ -38,8 +38,8 @@ def export_run(
         agent: as `delayrl.load`.
 
     Raises:
-        DelayRLError: no run, an agent without a deterministic policy or with another one than acts, or a folder that
-            holds something else.
+        DelayRLError: no run, an agent without a deterministic policy or with another one than acts, observations too
+            far from 0 for single precision, or a folder that holds something else.
     """
     check_target(Path(out), force=force)
     source = RunFolder(path_of(run))
@@ -54,12 +54,9 @@ def export_run(
 
     first = np.zeros(network.obs_size), np.zeros((network.max_age, network.action_size)), 0
     if np.array_equal(act(*first), act(*first)):  # else it samples in evaluation, and its network gives the mode
-        otherwise, usual = f"{config['agent']}: its `deterministic` does not give the actions of its `act`", None
-        if (known := getattr(policy.agent, "usual", None)) is not None:
-            otherwise = "its network reads observations whose mean is too large for their deviation: subtract it before"
-            mean, spread = known(policy.state)
-            usual = np.asarray(mean), np.asarray(spread)
-        check_same(network, arrays, act, otherwise, usual)
+        otherwise = f"{config['agent']}: its `deterministic` does not give the actions of its `act`"
+        normalised: Any = policy.agent if config["schedule"].get("observation_norm") == "running" else None
+        check_same(network, arrays, act, otherwise, normalised and normalised.usual(policy.state))
     write_files(Path(out), pack(network, arrays, metadata), force=force)
     return metadata
 

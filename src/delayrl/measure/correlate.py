@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 
 ORDER = 10  # rows of the past in a model; fewer if the log is short for its width
 ECHO = 0.95  # correlation of increments at which an observation is a command that comes back, and no plant's answer
-CHANCE = 1e-3  # probability that any lag of unrelated signals is taken for an onset
+CHANCE = 1e-3  # probability that any lag of unrelated signals is taken for an onset; about 5e-3 with 200 rows
 SHARE = 0.2  # least strength of the onset, relative to the strongest lag: nonlinear feedback leaves traces before it
 OUTLIER = 5.0  # standard deviations at which innovations are clipped: falls, collisions, wrap-around of angles
 
@@ -85,10 +85,10 @@ def innovations(commands: Array, observations: Array, episode: Array) -> tuple[A
     return _standard(new_u, commanded) * (len(u) / max(int(commanded.sum()), 1)) ** 0.5, _standard(new_y, has_past)
 
 
-def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, int]:
-    """Sum the products of lagged u and y in `count` blocks of rows; return [count, lags, U, Y] and the rows of a block.
+def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, Array]:
+    """Return sums of products of lagged u and y in `count` blocks of rows, [count, lags, U, Y], and of how many.
 
-    The lags are 1..longest, followed by far lags, as many as the log allows.
+    The lags are 1..longest, followed by far lags, as many as the log allows. The first rows have no product at a lag.
     """
     size = len(u) // count
     rows = size * count
@@ -99,17 +99,23 @@ def blocks(u: Array, y: Array, longest: int, count: int) -> tuple[Array, int]:
     for i, lag in enumerate(lags):
         lagged = np.zeros((rows, u.shape[1]))
         lagged[lag:] = u[: rows - lag]
-        # fewer rows have a product at a long lag: with equal weights the far lags would look as if chance were rarer
-        sums[:, i] = lagged.reshape(count, size, -1).transpose(0, 2, 1) @ target * (rows / (rows - lag)) ** 0.5
-    return sums, size
+        sums[:, i] = lagged.reshape(count, size, -1).transpose(0, 2, 1) @ target
+    ends = size * np.arange(1, count + 1)[:, None]
+    return sums, np.clip(ends - np.array(lags), 0, size)
 
 
-def correlation(sums: Array, size: int, longest: int, weights: Array | None = None) -> Correlation:
-    """Combine blocks of `size` rows into correlations; each block counts `weights` times, [count]."""
+def correlation(sums: Array, products: Array, longest: int, weights: Array | None = None) -> Correlation:
+    """Combine blocks of products into correlations; each block counts `weights` times, [count].
+
+    A sum of fewer products is scaled as if chance had more, so that N r² of unrelated signals is alike at all lags. Far
+    lags with less than half of the most are left out.
+    """
     weights = np.ones(len(sums)) if weights is None else weights
-    total = float(weights.sum() * size)
-    r = np.tensordot(weights, sums, 1) / total
-    return Correlation(r[:longest], r[longest:], total)
+    total = weights @ products
+    rows = float(total.max())
+    r = np.tensordot(weights, sums, 1) / np.sqrt(np.maximum(total, 1) * rows)[:, None, None]
+    known = total[longest:] >= min(rows / 2, total[longest:].max())
+    return Correlation(r[:longest], r[longest:][known], rows)
 
 
 def strength(c: Correlation) -> tuple[Array, Array]:

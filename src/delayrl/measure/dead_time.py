@@ -32,15 +32,15 @@ def by_correlation(
         raise DelayRLError(f"{path}: {rows} rows of {row:g} s are too few to look for {tried}")
     u, y = correlate.innovations(commands, observations, episode)
     blocks = int(np.clip(rows // (2 * lags), WINDOWS, BLOCKS)) // WINDOWS * WINDOWS  # windows are whole blocks
-    sums, size = correlate.blocks(u, y, lags, blocks)
-    correlation = correlate.correlation(sums, size, lags)
+    sums, products = correlate.blocks(u, y, lags, blocks)
+    correlation = correlate.correlation(sums, products, lags)
     first = correlate.onset(correlation)
     if first is None:
         hint = "A longer log, other columns, or commands with some random variation may show one"
         unseen = f"no delay found up to {lags * row:.3g} s: no observation follows a command beyond chance"
         raise DelayRLError(f"{path}: {unseen}. {hint}")
-    low, high = _interval(sums, size, lags, row, seed)
-    windows = _windows(sums, size, lags, min(WINDOWS, rows // WINDOW_ROWS), row, warm)
+    low, high = _interval(sums, products, lags, row, seed)
+    windows = _windows(sums, products, lags, min(WINDOWS, rows // WINDOW_ROWS), row, warm)
     pairs, r = _pairs(log, commands, observations, episode, lags, row)
     strength = correlate.strength(correlation)[0]
     renewed, wait = _renewed(observations, episode, row, period)
@@ -86,23 +86,25 @@ def _used(path: Path, log: reading.Log, row: float, warm: float) -> tuple[Array,
     return commands, observations, log.episode[used]
 
 
-def _interval(sums: Array, size: int, lags: int, row: float, seed: int) -> tuple[float, float]:
+def _interval(sums: Array, products: Array, lags: int, row: float, seed: int) -> tuple[float, float]:
     """Return the 95 % interval of the dead time: blocks are drawn again, with replacement."""
     random, dead_times = np.random.default_rng(seed), []
     for _ in range(RESAMPLINGS):
         weights = np.bincount(random.integers(0, len(sums), len(sums)), minlength=len(sums)).astype(float)
-        lag = correlate.onset(correlate.correlation(sums, size, lags, weights))
+        lag = correlate.onset(correlate.correlation(sums, products, lags, weights))
         if lag is not None:
             dead_times.append((lag - 1) * row)
     low, high = np.quantile(dead_times, (0.025, 0.975)) if dead_times else (0.0, lags * row)
     return max(0.0, float(low) - row), float(high) + row  # the log does not show what happens between two rows
 
 
-def _windows(sums: Array, size: int, lags: int, count: int, row: float, warm: float) -> tuple[tuple[float, float], ...]:
+def _windows(
+    sums: Array, products: Array, lags: int, count: int, row: float, warm: float
+) -> tuple[tuple[float, float], ...]:
     """Return the middle, in seconds, and the dead time of each of `count` parts of the log that shows one."""
-    windows = []
+    windows, size = [], int(products.max())  # rows of a block
     for part in np.array_split(np.arange(len(sums)), count) if count > 1 else []:
-        lag = correlate.onset(correlate.correlation(sums[part], size, lags))
+        lag = correlate.onset(correlate.correlation(sums[part], products[part], lags))
         if lag is not None:
             windows.append((float(warm + part.mean() * size * row + size * row / 2), (lag - 1) * row))
     return tuple(windows)

@@ -39,7 +39,7 @@ class Estimated:
     period: float  # of control, in seconds
     rows: int  # how many were used
     warm_up: float  # seconds left out at the start
-    steps: tuple[int, ...]  # the delay of each window or observation, in steps, in order of time
+    steps: tuple[int, ...]  # of each window or observation as `step`, in order of time
     step: int  # `delay` without `wait` in steps
     span: tuple[float, float]  # the shortest and the longest delay to train for, in seconds; see `train_with`
     step_span: tuple[int, int]  # the same for a sensor in step with the loop, in steps; see `in_step`
@@ -47,7 +47,7 @@ class Estimated:
     peak: Pair | None = None  # largest correlation of increments; its lag includes the plant's own lag
     pairs: tuple[Pair, ...] = ()  # the strongest pairs
     renewed: float | None = None  # correlation only: seconds between two changes of the observation, the median
-    wait: float = 0.0  # seconds of `delay` that a sensor read once a period waits, beyond the row of a continuous one
+    wait: float = 0.0  # seconds of `delay` that a sensor may wait until it is read again, up to a period, less a row
     windows: tuple[tuple[float, float], ...] = ()  # (middle in seconds, dead time) of each part that shows one
     replay: tuple[tuple[int, int], ...] = ()  # stamps only: what `save` writes, see `ages.replay`
     echoes: tuple[str, ...] = ()  # correlation only: observations that repeat a command

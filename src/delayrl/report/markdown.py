@@ -87,7 +87,7 @@ def _aggregates(summary: Summary, aggregates: Sequence[Aggregate]) -> str:
                 continue
             interval = wording.interval((a.low, a.high), wording.normalised)
             counts = GREY.format(wording.aggregate_counts(a))
-            line.append("<br>".join(filter(None, (f"**{a.iqm:.2f}**", interval, counts))))
+            line.append("<br>".join(filter(None, (f"**{wording.normalised(a.iqm)}**", interval, counts))))
         body.append(line)
     return markdown_table(["Δ", *(_escape(summary.name(label)) for label in labels)], body)
 

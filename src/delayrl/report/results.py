@@ -20,8 +20,8 @@ from delayrl.run.cost import Cost
 
 PAPER_ORDER = ("a-sac", "dcac", "dida", "bpql", "ad-sac", "vdpo")
 """Columns of the paper's tables."""
-BUDGET = frozenset({"steps", "evaluate_every", "evaluation_episodes", "replay_capacity", "precision"})
-"""Options that leave an agent what it is."""
+MINOR = frozenset({"steps", "evaluate_every", "evaluation_episodes", "replay_capacity", "precision"})
+"""Options that do not make another agent of a reference."""
 
 
 class Curves(NamedTuple):
@@ -227,7 +227,7 @@ def make_results(
 def ended_by_delay(results: Iterable[Result]) -> dict[tuple[Setting, int | str | None], list[Result]]:
     """Group learners whose seeds have ended by setting and delay, in order; under None, those of all constant ones.
 
-    Those of which a cell has failed are left out: the seeds that did not fail are the better ones.
+    Those of which a cell has failed are left out: the seeds that did not fail may be the better ones.
     """
     groups: dict[tuple[Setting, int | str | None], list[Result]] = defaultdict(list)
     for result in results:
@@ -301,7 +301,8 @@ def _anchored(result: Result, others: Sequence[Result]) -> Result:
     setting, env = result.place.setting, result.place.env
     near = [o for o in others if o.place.setting.protocol == setting.protocol and o.place.env == env and o.runs]
     randoms = [o for o in near if o.condition.agent == "random"]  # it has no hyperparameters: any preset
-    ended = [o for o in near if o.place.setting == setting and not o.partial and FROM not in o.condition.overrides]
+    whole = [o for o in near if not o.partial and o.progress.state != "failed"]
+    ended = [o for o in whole if o.place.setting == setting and FROM not in o.condition.overrides]
     plain = [o for o in ended if o.condition.agent == "sac" and o.place.delay == 0]
     same = [o for o in plain if o.condition.steps == result.condition.steps]
     longer = [o for o in plain if o.condition.steps > result.condition.steps]
@@ -327,4 +328,4 @@ def _fewest_overrides(result: Result) -> tuple[Any, ...]:
 
 def _changed(result: Result) -> int:
     """Count the options that make it another agent than the preset's."""
-    return len(result.condition.overrides.keys() - BUDGET)
+    return len(result.condition.overrides.keys() - MINOR)

@@ -14,7 +14,7 @@ from delayrl.report.summary import Aggregate, Summary
 from delayrl.report.tables import Table, TableEntry
 from delayrl.run.cell import CellState
 from delayrl.run.cost import Cost
-from delayrl.run.rows import number_in_words, unsigned_zero
+from delayrl.run.rows import number_in_words, shown_like, unsigned_zero
 
 PAPER = (
     "Paper: Wu et al., Variational Delayed Policy Optimization, NeurIPS 2024; 10 seeds, 1,000,000 steps. It states no "
@@ -44,7 +44,7 @@ def steps(value: float) -> str:
 
 def spread(value: float, std: float, write: Callable[[float], str] | None = None) -> str:
     """Write mean ± standard deviation, by default with equally many decimals; a deviation of NaN is left out."""
-    write = write or partial(number, like=value)
+    write = write or partial(number, like=shown_like(value, std))
     return "" if math.isnan(value) else write(value) + ("" if math.isnan(std) else f" ± {write(std)}")
 
 
@@ -124,8 +124,8 @@ CELLS_CAPTION = (
 )
 AGGREGATE_CAPTION = (
     "Over all tasks, with as many runs of each as the one with fewest has; 95 % interval. Agents that lack a task on "
-    "which another has ended at this delay are left out, because means over different tasks cannot be compared. So is "
-    "a result with a failed run."
+    "which another has ended at this delay are left out, because means over different tasks cannot be compared, and so "
+    "are results with a failed run."
 )
 COMPARISON_CAPTION = (
     "How probable it is that a run of the row's agent ends above a run of the column's on the same task, in the mean "
@@ -173,7 +173,7 @@ def hours(value: float) -> str:
 def signed(value: float) -> str:
     """Write a difference of normalised returns; 0.00 has no sign."""
     text = f"{value:+.2f}"
-    return text if float(text) else text[1:]
+    return text if float(text) else normalised(0)
 
 
 COST_HEAD = ("Agent", "Reads the true state", "Parameters", "Gradient steps", "Batch", "FLOP")

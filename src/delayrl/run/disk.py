@@ -104,6 +104,15 @@ def lock(path: Path, *, shared: bool = False, patience: float = 0) -> Iterator[b
         os.close(handle)
 
 
+PASSING = {errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EINTR}
+"""Errors of a disk, mostly of one on a network, that another try may not meet. A full disk stays full."""
+
+
+def passes(error: BaseException) -> bool:
+    """Tell whether an error, or what caused it, is one of `PASSING`."""
+    return any(isinstance(one, OSError) and one.errno in PASSING for one in (error, error.__cause__))
+
+
 @contextlib.contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
     """Turn what the disk refuses into one line."""

@@ -26,7 +26,7 @@ from typing import Any
 from delayrl.errors import DelayRLError, first_line
 from delayrl.run.arrays import Arrays, save_arrays
 from delayrl.run.checkpoint import Checkpoint, checkpoint_folders, read_checkpoint
-from delayrl.run.disk import disk_errors, draft, lock, parsed, remove, write_file, write_flushed
+from delayrl.run.disk import disk_errors, draft, lock, parsed, passes, remove, write_file, write_flushed
 from delayrl.run.rows import check_rows
 
 FORMAT = 1
@@ -35,7 +35,7 @@ CONFIG: dict[str, Any] = {"format": int, **NAMES, "hyperparameters": dict, "sche
 """What a configuration must hold, with its types."""
 MORE: dict[str, Any] = {"versions": dict, "later_versions": list, "configuration": str, "origin": dict, "unnamed": dict}
 MORE |= {"seed": int, "protocol": str, "hyperparameters": dict, "schedule": dict}
-"""What it may hold besides."""
+"""What any configuration that is read may hold, a collected one too."""
 FOLDERS = ("checkpoints", "replay", "tensorboard", "wandb")
 LINES = ("rows", "metrics", "episodes")
 FILES = (*(f"{name}.jsonl" for name in LINES), "curve.png", "delays.png", "config.json")
@@ -161,6 +161,8 @@ class RunFolder:
                 found = read_checkpoint(path)
                 found.check(replay=replay and not found.complete)
             except (OSError, DelayRLError) as error:
+                if passes(error):  # it may be whole
+                    raise DelayRLError(f"checkpoint {path} cannot be read now: {error}") from (error.__cause__ or error)
                 found = f"checkpoint {path} is broken ({error})"
             yield found
 
@@ -272,8 +274,6 @@ def _check_config(config: Mapping[str, Any], file: Path) -> None:
     for name, kind in CONFIG.items():
         if not isinstance(config.get(name), kind):
             raise DelayRLError(f"{file} is damaged, or of another program: no {name}")
-    if not isinstance(config["schedule"].get("steps"), int):
-        raise DelayRLError(f"{file} is damaged: its schedule has no steps")
     if config["format"] != FORMAT:
         raise DelayRLError(f"{file} has format {config['format']}; this version reads {FORMAT}")
     check_more(config, file)
@@ -285,10 +285,10 @@ def check_more(config: Mapping[str, Any], where: object) -> None:
         value = config.get(name, kind())
         if not isinstance(value, kind) or (kind is list and not all(isinstance(part, dict) for part in value)):
             raise DelayRLError(f"{where} is damaged: no good {name}: {value!r:.60}")
-    source = config.get("origin", {}).get("from", {})
-    steps = config.get("schedule", {}).get("steps", 0)
-    if not isinstance(source, dict) or type(steps) is not int:
-        raise DelayRLError(f"{where} is damaged: no good origin or steps")
+    if type(config.get("schedule", {"steps": 0}).get("steps")) is not int:
+        raise DelayRLError(f"{where} is damaged: its schedule has no steps")
+    if not isinstance(source := config.get("origin", {}).get("from", {}), dict):
+        raise DelayRLError(f"{where} is damaged: no good origin: {source!r:.60}")
 
 
 def is_config(file: Path) -> bool:

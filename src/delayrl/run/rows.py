@@ -47,13 +47,18 @@ def deviation(returns: Sequence[float] | NDArray[np.float64]) -> float | None:
 
 
 def number_in_words(value: float, like: float | None = None, *, least: int = 1, comma: str = ",") -> str:
-    """Write a number with at least this many decimals; below 1 with three digits, if there are any in six decimals.
+    """Write a number with at least this many decimals; from 0.000001 to 1 with as many as show three digits.
 
     `like` is another number whose decimals it gets, as a deviation gets those of its mean. A rounded 0 has no sign.
     """
     size = abs(value if like is None else like)
     decimals = max(least, 2 - math.floor(math.log10(size))) if 1e-6 <= size < 1 else least
     return unsigned_zero(f"{value:{comma}.{decimals}f}")
+
+
+def shown_like(mean: float, *others: float) -> float:
+    """Return the number whose decimals a mean and its deviation or bounds get: the largest, if the mean is below 1."""
+    return mean if abs(mean) >= 1 else max((mean, *others), key=lambda value: -1 if math.isnan(value) else abs(value))
 
 
 def unsigned_zero(text: str) -> str:
@@ -64,8 +69,9 @@ def unsigned_zero(text: str) -> str:
 def return_in_words(returns: Sequence[float] | NDArray[np.float64]) -> str:
     """Write the mean of episodes' returns, ± their standard deviation, and of how many episodes it is."""
     mean, spread = float(np.mean(returns)), deviation(returns)
-    words = "" if spread is None else f" ± {number_in_words(spread, mean, comma='')}"
-    return f"{number_in_words(mean, comma='')}{words} over {count(np.size(returns), 'episode')}"
+    like = mean if spread is None else shown_like(mean, spread)
+    words = "" if spread is None else f" ± {number_in_words(spread, like, comma='')}"
+    return f"{number_in_words(mean, like, comma='')}{words} over {count(np.size(returns), 'episode')}"
 
 
 def name_configuration(rows: Sequence[Row]) -> list[Row]:

@@ -60,7 +60,7 @@ def taken_over(agent: State, source: Checkpoint, note: Callable[[str], None]) ->
     left = ", ".join(part for part in parts if part not in taken)
     if not parts:
         raise DelayRLError(f"there is no network to take over from {source.path.parents[1]}: this agent has none")
-    if not networks_of(fresh).intersection(taken):
+    if not set(taken) - measured_of(fresh):
         where, norms = source.path.parents[1], [_normalisation(arrays) for arrays in (stored, fresh)]
         line = f"{where} has no network that fits: it lacks {left}, or has them in other sizes"
         hint = "; its observation_norm is {}, and that of the new run {}".format(*norms) if len(set(norms)) > 1 else ""
@@ -93,7 +93,7 @@ def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
     and counters are in no part: they are never taken over.
     """
     parts = parts_of(fresh)
-    deeper = {part_of(name) for name in stored.keys() - fresh.keys() if any(word.isdigit() for word in name.split("."))}
+    deeper = {part_of(name) for name in stored.keys() - fresh.keys() if _in_layers(name)}
 
     def fits(name: str) -> bool:
         return name in stored and stored[name].shape == fresh[name].shape
@@ -102,23 +102,21 @@ def fitting(fresh: Arrays, stored: Arrays) -> list[str]:
         return part.rpartition(".")[0]
 
     taken = [part for part, names in parts.items() if part not in deeper and all(map(fits, names))]
-    numbers, networks = {part for part in taken if part in fresh and fresh[part].ndim == 0}, networks_of(fresh)
-    begun = {agent_of(part) for part in networks.intersection(taken)}
-
-    def belongs(part: str) -> bool:
-        beside = {network for network in networks if network.startswith(f"{part}.")}
-        return agent_of(part) in begun if part in numbers else part in networks or beside <= {*taken}
-
-    return [part for part in taken if belongs(part)]
+    numbers = {part for part in taken if part in fresh and fresh[part].ndim == 0}
+    alone = {part for part in measured_of(fresh) if any(o.startswith(f"{part}.") and o not in taken for o in parts)}
+    begun = {agent_of(part) for part in taken if part not in numbers | alone}
+    return [part for part in taken if part not in alone and (part not in numbers or agent_of(part) in begun)]
 
 
-def networks_of(state: Arrays) -> set[str]:
-    """Return the parts that have layers or matrices, and are not only measured, as moments of observations are."""
+def measured_of(state: Arrays) -> set[str]:
+    """Return the parts that are measured and not learned: moments of observations, and what lies beside networks."""
+    parts = parts_of(state)
+    flat = {part for part, names in parts.items() if all(state[n].ndim < 2 and not _in_layers(n) for n in names)}
+    return {part for part in flat if part == "moments" or any(other.startswith(f"{part}.") for other in parts)}
 
-    def learned(name: str) -> bool:
-        return state[name].ndim > 1 or any(word.isdigit() for word in name.split("."))
 
-    return {part for part, names in parts_of(state).items() if any(map(learned, names))}
+def _in_layers(name: str) -> bool:
+    return any(word.isdigit() for word in name.split("."))
 
 
 def parts_of(state: Arrays) -> dict[str, list[str]]:

@@ -51,7 +51,7 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
     checkpoints = [] if plan.replaced else _common_checkpoints(group, note)
     state = restore(group, actors, checkpoints) if checkpoints else _fresh(group, actors, note)
     config = group.setup.config | {"configuration": group.setup.configuration}
-    if plan.new or plan.longer or not checkpoints:
+    if plan.longer or not checkpoints:
         config["cost"] = cost_of(group.setup.agent, group.spec, group.setup.schedule).json
     used = versions()
     if code := code_of(config["agent"], group.setup.agent):
@@ -61,14 +61,12 @@ def start(group: Group, actors: list[Actor], overwrite: bool, note: Callable[[st
             evaluator.close()
     for run in plan.replaced:
         run.remove()
-    for run, seed in zip(group.folders, group.seeds, strict=True):
-        if run in plan.new or not checkpoints:  # of a run that begins anew nothing is older code's
-            run.create(config | {"versions": used, "seed": seed})
     if checkpoints:
         _go_on(group, plan, checkpoints, config, used, note)
-    else:
-        for run in group.folders:
-            run.rewind(-1)
+        return state
+    for run, seed in zip(group.folders, group.seeds, strict=True):  # a run that begins anew keeps nothing
+        run.create(config | {"versions": used, "seed": seed})
+        run.rewind(-1)
     return state
 
 

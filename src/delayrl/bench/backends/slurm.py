@@ -39,7 +39,12 @@ while kill -0 $runner 2>/dev/null; do # the signal ended `wait`, not the runner
     wait $runner
     status=$?
 done
-if [ $status -eq {stopped} ] || [ $status -eq 143 ]; then # 143: the signal came before the runner had begun
+if [ $status -eq 143 ]; then # the signal came before the runner had begun, or as it ended
+    wait $runner
+    last=$?
+    [ $last -eq 127 ] || status=$last
+fi
+if [ $status -eq {stopped} ] || [ $status -eq 143 ]; then
     scontrol requeue "$SLURM_JOB_ID"
 fi
 exit $status
