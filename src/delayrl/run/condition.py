@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from delayrl.agents.base import Agent, Schedule
-from delayrl.agents.registry import Preset
+from delayrl.agents.registry import Registration
 from delayrl.core.protocol import Protocol, opening_length
 from delayrl.core.replay import Learnable
 from delayrl.core.types import Spec
@@ -132,8 +132,7 @@ def resolve(
     check_not_taken(name, base.agent)
     check_names(overrides, base.agent, base.schedule)
     values = {**chosen.overrides, **overrides}
-    steps = override(base.schedule, values).steps
-    values = following(preset, base, steps, scaled=not registration.given) | values
+    values = following(registration, preset, override(base.schedule, values).steps) | values
     schedule = override(base.schedule, values)
     task = as_task(env)
     parsed = delay_of(task, delay)
@@ -151,9 +150,10 @@ def resolve(
     return Setup(condition, task, made, schedule, parsed, chosen, {k: _digest(x) for k, x in unnamed.items() if x})
 
 
-def following(name: str, preset: Preset, steps: int, *, scaled: bool = True) -> dict[str, int]:
-    """Return the options of a preset that are other numbers in a run of so many steps; the agent's only if `scaled`."""
+def following(registration: Registration, name: str, steps: int) -> dict[str, int]:
+    """Return the options of the preset called `name` that are other numbers in a run of so many steps."""
+    preset = registration.presets[name]
     usual, length = {**values_of(preset.agent), **values_of(preset.schedule)}, preset.schedule.steps
-    own = [option.name for option in options(preset.agent) if option.scales] if scaled else []
+    own = [option.name for option in options(preset.agent) if option.scales and not registration.given]
     names = (*own, *(GROWS.get(name, ()) if steps > length else ()))
     return {name: -(-usual[name] * steps // length) for name in names if name in usual and steps != length}

@@ -32,8 +32,7 @@ def overrides_of(config: Mapping[str, Any]) -> dict[str, Any]:
         preset, chosen = registration.presets[config["preset"]], registration.protocol(config["protocol"])
     except (KeyError, DelayRLError):
         return {}
-    steps, scaled = config["schedule"]["steps"], not registration.given
-    habits = {**following(config["preset"], preset, steps, scaled=scaled), **chosen.overrides}
+    habits = {**following(registration, config["preset"], config["schedule"]["steps"]), **chosen.overrides}
     usual = {k: v for part in preset for k, v in values_of(override(part, habits)).items()}
     implied = {name: value for name, value in OLDER.items() if name in usual}
     options = {**implied, **config["hyperparameters"], **config["schedule"]}
