@@ -126,12 +126,12 @@ def choose(results: list[Result]) -> Chosen:
     return chosen
 
 
-def comparable(results: list[Result]) -> list[Result]:
-    """Return the results of ARMS under one protocol, preset, precision and budget, those with most seeds last.
+def comparable(results: list[Result], arms: Collection[str] = ARMS) -> list[Result]:
+    """Return the results of `arms` under one protocol, preset, precision and budget, those with most seeds last.
 
     Raises DelayRLError if some of a task were not evaluated at the same steps: their means over training would differ.
     """
-    alike = [r for r in results if r.place.setting == Setting("corrected", "matched") and name(r) in ARMS and ended(r)]
+    alike = [r for r in results if r.place.setting == Setting("corrected", "matched") and name(r) in arms and ended(r)]
     budget = [r for r in alike if r.condition.steps == STEPS.get(r.place.env)]
     same = sorted((r for r in budget if r.condition.overrides.get("precision") == "bfloat16"), key=lambda r: r.runs)
     if mixed := {env for env in STEPS if len({tuple(r.curves.steps) for r in same if r.place.env == env}) > 1}:

@@ -94,12 +94,13 @@ def spread(values: statistics.Floats) -> str:
     return f"{mean:,.0f}" + ("" if np.isnan(std) else f" ± {std:,.0f}")
 
 
-def difference(one: statistics.Floats, other: statistics.Floats | None) -> str:
-    """Write the difference of the means with its 95 % interval, by Welch's t."""
+def difference(one: statistics.Floats, other: statistics.Floats | None, digits: int = 0) -> str:
+    """Write the difference of the means with its 95 % interval, by Welch's t, with `digits` decimals."""
     if other is None or min(one.size, other.size) < 2:
         return ""
     low, high = stats.ttest_ind(one, other, equal_var=False).confidence_interval()
-    return f"{one.mean() - other.mean():+,.0f} ({low:+,.0f} to {high:+,.0f})"
+    middle, low, high = (f"{value:+,.{digits}f}" for value in (one.mean() - other.mean(), low, high))
+    return f"{middle} ({low} to {high})"
 
 
 def draw(runs: Runs, out: Path) -> None:
@@ -120,8 +121,8 @@ def bold(text: str) -> str:
     """Write in bold a difference whose interval leaves out 0; a difference without an interval is empty."""
     if not text:
         return ""
-    low, high = re.findall(r"[-+][\d,]+", text)[1:]
-    return f"**{text}**" if low[0] == high[0] and (low[1:], high[1:]) != ("0", "0") else text
+    low, high = re.findall(r"[-+][\d,.]+", text)[1:]
+    return f"**{text}**" if low[0] == high[0] and {low[1:], high[1:]} - {"0", "0.0"} else text
 
 
 def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any) -> Line2D:
