@@ -19,6 +19,7 @@ import matplotlib
 import numpy as np
 import pairs
 import paper_row
+import questions
 import sweeps
 
 matplotlib.use("Agg")
@@ -284,7 +285,7 @@ def main() -> None:
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
-    for name in ("first", "evidence-1", "evidence-1-paper", "evidence-2"):
+    for name in ("first", "evidence-1", "evidence-1-paper", "evidence-2", "evidence-3"):
         folder = root / "docs" / "results" / ("" if name == "first" else name)
         delayrl(["bench", "report", str(HERE / "results" / f"{name}.sqlite"), "--out", str(folder)])
     text = learning.section(HERE / "results" / "learning", images / "learning.png")
@@ -312,6 +313,8 @@ def main() -> None:
         insert(root / "docs" / "benchmarks.md", key, text)
     paper = paper_row.section(HERE / "results" / "evidence-1-paper.sqlite")
     insert(root / "docs" / "benchmarks.md", "paper-row", paper)
+    asked = questions.section(HERE / "results" / "evidence-3.sqlite")
+    insert(root / "docs" / "algorithms" / "vdpo.md", "questions", asked)
     insert(root / "docs" / "benchmarks.md", "lost", lost.section(rows, images / "lost.png"))
     insert(root / "docs" / "algorithms" / "any-age-trials.md", "forecast", forecast.section())
     text = times.section(HERE / "results" / "times", images / "times.png")

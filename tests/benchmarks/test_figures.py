@@ -54,6 +54,7 @@ def test_the_result(tmp_path: Path) -> None:
     assert section("docs/algorithms/any-age-results.md", "ladder") == arms
     assert section("docs/algorithms/any-age-trials.md", "goals") == goals
     assert section("docs/benchmarks.md", "paper-row") == figures.paper_row.section(*tables("evidence-1-paper"))
+    assert section("docs/algorithms/vdpo.md", "questions") == figures.questions.section(*tables("evidence-3"))
 
 
 @pytest.mark.thorough
@@ -72,7 +73,8 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
 
 
-THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in ("evidence-1", "evidence-1-paper", "evidence-2")]
+LONGER = ("evidence-1", "evidence-1-paper", "evidence-2", "evidence-3")
+THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in LONGER]
 
 
 @pytest.mark.parametrize("name", ["first", *THOROUGH])
