@@ -99,8 +99,7 @@ def difference(one: statistics.Floats, other: statistics.Floats | None, digits: 
     if other is None or min(one.size, other.size) < 2:
         return ""
     low, high = stats.ttest_ind(one, other, equal_var=False).confidence_interval()
-    middle, low, high = (f"{value:+,.{digits}f}" for value in (one.mean() - other.mean(), low, high))
-    return f"{middle} ({low} to {high})"
+    return f"{one.mean() - other.mean():+,.{digits}f} ({low:+,.{digits}f} to {high:+,.{digits}f})"
 
 
 def draw(runs: Runs, out: Path) -> None:
@@ -122,7 +121,7 @@ def bold(text: str) -> str:
     if not text:
         return ""
     low, high = re.findall(r"[-+][\d,.]+", text)[1:]
-    return f"**{text}**" if low[0] == high[0] and {low[1:], high[1:]} - {"0", "0.0"} else text
+    return f"**{text}**" if low[0] == high[0] and re.search("[1-9]", low + high) else text
 
 
 def curve(axes: Axes, steps: statistics.Floats, returns: statistics.Floats, colour: Any) -> Line2D:

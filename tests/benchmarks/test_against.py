@@ -89,6 +89,8 @@ def test_holms_correction(values: list[float], clear: list[bool]) -> None:
         ("-9 (-19 to -1)", True),
         ("+9 (+1 to +1,900)", True),
         ("-0 (-0 to -0)", False),
+        ("-0.0 (-0.0 to -0.0)", False),
+        ("+0.2 (+0.1 to +0.3)", True),
         ("+3 (+0 to +6)", True),
     ],
 )

@@ -7,40 +7,45 @@ from finished import result
 
 from delayrl.report.results import Result
 
-ENV, STEPS = "delayrl/Pusher-v4", 40_000
+PUSHER, CHEETAH = ("delayrl/Pusher-v4", 25), ("HalfCheetah-v5", 5)
+STEPS = {PUSHER: 40_000, CHEETAH: 100_000}
 
 
-def of(returns: list[list[float]], agent: str = "vdpo", **overrides: str) -> Result:
-    plain = result(agent, 25, returns, **overrides)
-    condition = replace(plain.condition, env=ENV, steps=STEPS)
+def of(returns: list[list[float]], case: tuple[str, int] = PUSHER, agent: str = "vdpo", **overrides: str) -> Result:
+    env, delay = case
+    plain = result(agent, delay, returns, **overrides)
+    condition = replace(plain.condition, env=env, steps=STEPS[case])
     privileged = agent == "vdpo" and overrides.get("behaviour") != "delayed"
-    return replace(plain, place=plain.place._replace(env=ENV), condition=condition, privileged=privileged)
+    return replace(plain, place=plain.place._replace(env=env), condition=condition, privileged=privileged)
 
 
 def test_a_change_stands_beside_the_unchanged_agent() -> None:
-    """Highest over training first; another agent and what has not ended are left out."""
-    lower = of([[-80.0, -40.5], [-80.0, -40.0], [-80.0, -39.5]], behaviour="delayed")
+    """Highest over training first; another agent, what has not ended and what has no change are left out."""
+    higher = of([[-60.0, -40.5], [-60.0, -40.0], [-60.0, -39.5]], behaviour="delayed")
     results = [
-        of([[-60.0, -40.2], [-60.0, -39.8]]),
-        replace(lower, cost=replace(lower.cost, flops=2 * lower.cost.flops)),
+        of([[-80.0, -40.2], [-80.0, -39.8]]),
+        replace(higher, cost=replace(higher.cost, flops=2 * higher.cost.flops)),
         of([[0.0, 0.0], [0.0, 1.0]], agent="bpql"),
         replace(of([[0.0, 0.0], [0.0, 1.0]], n_steps="1"), seeds=3),
+        of([[0.0, 4000.0], [0.0, 4002.0]], CHEETAH),
+        of([[0.0, 2000.0], [0.0, 2002.0]], CHEETAH, direction="forward"),
     ]
-    (table,) = questions.tables(results)
-    title, _, _, _, *body = table.splitlines()
-    assert title == "**Pusher, 25 steps late**"
-    assert [row.strip("| ").split(" | ") for row in body] == [
-        ["none † (2 seeds)", "0.01", "-40.0 ± 0.3", "", "-50.0 ± 0.1", "", "1.00"],
+    tables = [table.splitlines() for table in questions.tables(results)]
+    assert [table[0] for table in tables] == ["**Pusher, 25 steps late**", "**HalfCheetah, 5 steps late**"]
+    pusher, cheetah = ([row.strip("| ").split(" | ") for row in table[4:]] for table in tables)
+    assert pusher == [
         [
             "`behaviour=delayed` (3 seeds)",
             "0.01",
             "-40.0 ± 0.5",
             "+0.0 (-1.1 to +1.1)",
-            "-60.0 ± 0.2",
-            "**-10.0 (-10.6 to -9.4)**",
+            "-50.0 ± 0.2",
+            "**+10.0 (+9.4 to +10.6)**",
             "2.00",
         ],
+        ["none † (2 seeds)", "0.01", "-40.0 ± 0.3", "", "-60.0 ± 0.1", "", "1.00"],
     ]
+    assert cheetah[1][:4] == ["`direction=forward` † (2 seeds)", "0.53", "2,001 ± 1", "**-2,000 (-2,006 to -1,994)**"]
 
 
 def test_a_task_without_a_change_has_no_table() -> None:
