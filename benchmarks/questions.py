@@ -9,10 +9,9 @@ from learning.curves import bold, difference
 
 from delayrl.report.markup import markdown_table
 from delayrl.report.results import Result
-from delayrl.report.wording import normalised
 
 PLAIN = "`vdpo` †"
-HEAD = ["change", "normalised", "at the end", "minus unchanged", "over training", "minus unchanged", "arithmetic"]
+HEAD = ["change", "at the end", "minus unchanged", "over training", "minus unchanged", "arithmetic"]
 
 
 def section(file: Path) -> str:
@@ -47,7 +46,7 @@ def line(result: Result, base: Result) -> list[str]:
     """Write a line of a table: a change of VDPO beside `base`, which has none."""
     write = partial(difference, digits=0 if abs(base.curves.final.mean()) > 999 else 1)
     words = "none †" if result is base else name(result).removeprefix("`vdpo`, ")
-    cells = [words + seeds(result), normalised(result.final.mean())]
+    cells = [words + seeds(result)]
     for own, other in ((result.curves.final, base.curves.final), (area(result), area(base))):
         cells += [raw(own), "" if result is base else bold(write(own, other))]
     price = f"{result.cost.flops / base.cost.flops:.2f}" if result.cost and base.cost else ""
