@@ -44,6 +44,8 @@ from delayrl.training.cost import cost_of
 
 COLOURS = {agent: style[0] for agent, style in STYLES.items()} | {"vdpo reference": STYLES["sac"][0]}
 
+REPORTS = {"first": "", **{name: name for name in ("evidence-1", "evidence-1-paper", "evidence-2", "evidence-3")}}
+"""Tables of rows, and the folder of each one's report in docs/results."""
 DETAILS = ("speed-floors", "speed-operations")
 """Sections about speed for those who work on it, in speed/README.md."""
 
@@ -285,9 +287,9 @@ def main() -> None:
     insert(root / "docs" / "runtime.md", "udp", udp_table(udp))
     draw_udp = runpy.run_path(str(root / "examples" / "udp_demo" / "picture.py"))["draw"]
     draw_udp(udp, images / "udp.png")
-    for name in ("first", "evidence-1", "evidence-1-paper", "evidence-2", "evidence-3"):
-        folder = root / "docs" / "results" / ("" if name == "first" else name)
-        delayrl(["bench", "report", str(HERE / "results" / f"{name}.sqlite"), "--out", str(folder)])
+    for name, folder in REPORTS.items():
+        out = root / "docs" / "results" / folder
+        delayrl(["bench", "report", str(HERE / "results" / f"{name}.sqlite"), "--out", str(out)])
     text = learning.section(HERE / "results" / "learning", images / "learning.png")
     insert(root / "docs" / "benchmarks.md", "learning", text)
     any_age = root / "docs" / "algorithms" / "any-age-results.md"

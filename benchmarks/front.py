@@ -197,7 +197,12 @@ def seeds(result: Result) -> str:
 
 def raw(returns: Floats) -> str:
     """Write mean ± standard deviation, small ones with a decimal."""
-    return spread(returns) if abs(returns.mean()) > 999 else f"{returns.mean():.1f} ± {returns.std(ddof=1):.1f}"
+    return f"{returns.mean():.1f} ± {returns.std(ddof=1):.1f}" if decimals(returns) else spread(returns)
+
+
+def decimals(returns: Floats) -> int:
+    """Return how many decimals returns are written with."""
+    return 0 if abs(returns.mean()) > 999 else 1
 
 
 def draw(chosen: Chosen, out: Path) -> None:

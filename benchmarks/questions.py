@@ -3,7 +3,7 @@
 from functools import partial
 from pathlib import Path
 
-from front import SEEDS, comparable, name, raw, results_of, seeds, short
+from front import SEEDS, comparable, decimals, name, raw, results_of, seeds, short
 from ladder import area, made_on, read_table, rows_of, trained_with
 from learning.curves import bold, difference
 
@@ -44,7 +44,7 @@ def tables(results: list[Result]) -> list[str]:
 
 def line(result: Result, base: Result) -> list[str]:
     """Write a line of a table: a change of VDPO beside `base`, which has none."""
-    write = partial(difference, digits=0 if abs(base.curves.final.mean()) > 999 else 1)
+    write = partial(difference, digits=decimals(base.curves.final))
     words = "none †" if result is base else name(result).removeprefix("`vdpo`, ")
     cells = [words + seeds(result)]
     for own, other in ((result.curves.final, base.curves.final), (area(result), area(base))):

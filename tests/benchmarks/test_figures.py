@@ -73,13 +73,18 @@ def test_comparisons(tmp_path: Path) -> None:
     assert section("docs/benchmarks.md", "lost") == figures.lost.section(rows, tmp_path / "lost.png")
 
 
-LONGER = ("evidence-1", "evidence-1-paper", "evidence-2", "evidence-3")
-THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in LONGER]
+THOROUGH = [pytest.param(name, marks=pytest.mark.thorough) for name in figures.REPORTS if name != "first"]
+
+
+def test_each_report_is_checked() -> None:
+    assert {page.parent for page in (ROOT / "docs" / "results").rglob("report.md")} == {
+        ROOT / "docs" / "results" / folder for folder in figures.REPORTS.values()
+    }
 
 
 @pytest.mark.parametrize("name", ["first", *THOROUGH])
 def test_reports(name: str, tmp_path: Path) -> None:
-    folder = ROOT / "docs" / "results" / ("" if name == "first" else name)
+    folder = ROOT / "docs" / "results" / figures.REPORTS[name]
     delayrl(["bench", "report", str(*tables(name)), "--out", str(tmp_path)])
     assert (folder / "report.md").read_text() == (tmp_path / "report.md").read_text()
 
